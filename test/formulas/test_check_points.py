@@ -211,21 +211,14 @@ def test_points_of_the_source_check_nothing(known, is_refused):
         assert check(touched, ellipsoid(count=4000), result, EXACT).verdict is not Verdict.CONTRADICTED
 
 
-@pytest.mark.parametrize("within_mm", [0.0, -1.0, np.nan, np.inf])
-def test_an_error_that_matters_is_a_length(within_mm):
-    with pytest.raises(ConfigError, match="an error that matters, mm, above 0"):
-        check(on_ellipsoid(4, 1), plane(), answer(), EXACT, within_mm)
-
-
-@pytest.mark.parametrize("factor95", [0.0, -1.0, np.nan, np.inf])
-def test_a_bound_s_factor_that_is_none_is_an_error(factor95):
-    with pytest.raises(InvalidPointCloudError, match="a factor95 above 0"):
-        check(on_ellipsoid(4, 1), plane(), answer(factor95=factor95), EXACT)
-
-
-def test_the_settings_are_those_of_a_registrar():
-    with pytest.raises(ConfigError, match="a RegistrarConfig"):
-        check(on_ellipsoid(4, 1), plane(), answer(), SensorConfig())
+@pytest.mark.parametrize(("how", "sensor", "more", "said"), [
+    *[({}, EXACT, (mm,), "an error that matters, mm, above 0") for mm in (0.0, -1.0, np.nan, np.inf)],
+    *[({"factor95": factor}, EXACT, (), "a factor95 above 0") for factor in (0.0, -1.0, np.nan, np.inf)],
+    ({}, SensorConfig(), (), "a RegistrarConfig"),
+])  # fmt: skip
+def test_lengths_factors_and_settings_that_cannot_be_are_refused(how, sensor, more, said):
+    with pytest.raises((ConfigError, InvalidPointCloudError), match=said):
+        check(on_ellipsoid(4, 1), plane(), answer(**how), sensor, *more)
 
 
 def test_points_are_taken_from_the_frame_of_the_source():

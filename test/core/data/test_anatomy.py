@@ -33,36 +33,26 @@ def test_people_are_read_by_split_over_all_cohorts(tmp_path):
     assert anatomy.surfaces(tmp_path, "tibia") == []
 
 
-def test_a_person_in_two_splits_is_refused(tmp_path):
-    write_splits(tmp_path, train=["a", "b"], test=["b"])
-    with pytest.raises(ConfigError, match="b more than once"):
+@pytest.mark.parametrize(("text", "said"), [
+    ("{", "Expecting"), ("[1]", "list"), ("3", "int"), ('{"train": 1, "val": [], "test": []}', "without a list"),
+    ('{"train": [1], "val": [], "test": []}', "without a list"),
+    ('{"train": ["a", "b"], "val": [], "test": ["b"]}', "b more than once"), (None, "none in .*; write one"),
+])  # fmt: skip
+def test_splits_that_cannot_be_are_refused(tmp_path, text, said):
+    if text is not None:
+        (tmp_path / "splits.json").write_text(text)
+    with pytest.raises(ConfigError, match=said):
         anatomy.splits(tmp_path)
 
 
-@pytest.mark.parametrize("split", ["trian", ""])
-def test_an_unknown_split_is_refused(tmp_path, split):
+@pytest.mark.parametrize(("folder", "split", "said"), [
+    (".", "trian", "train, val, test"), (".", "", "train, val, test"), ("nowhere", "all", "--anatomy"),
+])  # fmt: skip
+def test_an_unknown_split_or_folder_is_refused(tmp_path, folder, split, said):
     write_set(tmp_path, "femur", "one", ["a"])
     write_splits(tmp_path, train=["a"])
-    with pytest.raises(ConfigError, match="train, val, test"):
-        anatomy.surfaces(tmp_path, "femur", split)
-
-
-def test_a_missing_folder_and_a_missing_splits_file_say_what_to_do(tmp_path):
-    with pytest.raises(ConfigError, match="--anatomy"):
-        anatomy.surfaces(tmp_path / "nowhere", "femur")
-    with pytest.raises(ConfigError, match="splits.json"):
-        anatomy.splits(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [("{", "Expecting"), ("[1]", "list"), ("3", "int"), ('{"train": 1, "val": [], "test": []}', "without a list"),
-     ('{"train": [1], "val": [], "test": []}', "without a list")],
-)  # fmt: skip
-def test_a_damaged_splits_file_is_named(tmp_path, text, said):
-    (tmp_path / "splits.json").write_text(text)
-    with pytest.raises(ConfigError, match=f"splits.json with subjects of train, val and test; got .*{said}"):
-        anatomy.splits(tmp_path)
+    with pytest.raises(ConfigError, match=said):
+        anatomy.surfaces(tmp_path / folder, "femur", split)
 
 
 def test_damaged_meshes_are_named(tmp_path):

@@ -228,36 +228,22 @@ def test_the_bound_at_a_target_is_the_assessment_s_own(registrar, target, femur)
     assert result.factor95 > 1.1
 
 
-def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path):
-    points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
-    moved, order = se3.apply(T, points), [2, 0, 3, 1]
-    names = ("a", "b", "c", "d")
-    markups.save(tmp_path / "s.mrk.json", markups.Markups(points, names))
-    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved[order], tuple(names[i] for i in order)))
-    start = planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
-    np.testing.assert_allclose(start.T_target_source, T, atol=1e-9)
-    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved, ("1", "2", "3", "4")))
-    np.testing.assert_allclose(
-        planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json").T_target_source, T, atol=1e-9
-    )
-    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved[:3], ("1", "2", "3")))
-    with pytest.raises(InvalidPointCloudError, match="4 in s.mrk.json and 3 in t.mrk.json"):
-        planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
-
-
-@pytest.mark.parametrize(("names", "is_by_name", "said"), [
-    (("D", "b", "A ", "c"), True, ""), (("d", "b", "apex", "c"), False, "have 3 of 4 names in common"),
-    (("d", "b", "b", "c"), False, "have 3 of 4 names in common"), (("1", "2", "", ""), False, ""),
+@pytest.mark.parametrize(("names", "order", "said"), [
+    (("c", "a", "d", "b"), [2, 0, 3, 1], ""), (("D", "b", "A ", "c"), [3, 1, 0, 2], ""),  # by name
+    (("1", "2", "3", "4"), [0, 1, 2, 3], ""), (("1", "2", "", ""), [0, 1, 2, 3], ""),  # in their order
+    (("d", "b", "apex", "c"), [0, 1, 2, 3], "have 3 of 4 names in common"),
+    (("d", "b", "b", "c"), [0, 1, 2, 3], "have 3 of 4 names in common"),
 ])  # fmt: skip
-def test_landmarks_whose_names_agree_in_part_are_warned_of(tmp_path, caplog, names, is_by_name, said):
+def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path, caplog, names, order, said):
     points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
-    moved = se3.apply(T, points)
     markups.save(tmp_path / "s.mrk.json", markups.Markups(points, ("a", "b", "c", "d")))
-    fixed = moved[[3, 1, 0, 2]] if is_by_name else moved
-    markups.save(tmp_path / "t.mrk.json", markups.Markups(fixed, names))
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(se3.apply(T, points)[order], names))
     start = planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
     np.testing.assert_allclose(start.T_target_source, T, atol=1e-9)
     assert [said in message for message in caplog.messages] == [True] * bool(said)
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(points[:3], ("1", "2", "3")))
+    with pytest.raises(InvalidPointCloudError, match="4 in s.mrk.json and 3 in t.mrk.json"):
+        planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
 
 
 def residuals():

@@ -33,20 +33,17 @@ def seen(image, pose, cloud=None, on_mm=3.0, front_mm=4.0):
     return float(found.explained[0]), float(found.violating[0]), float(found.compared[0])
 
 
-def test_a_target_that_lies_on_what_was_measured_is_explained_in_full(image):
-    assert seen(image, np.eye(4)) == pytest.approx((1.0, 0.0, 1.0), abs=1e-3)
-
-
-def test_a_target_in_front_of_what_was_measured_violates_free_space(image):
-    assert seen(image, moved(z_mm=-10.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-3)
-
-
-def test_a_target_behind_what_was_measured_may_be_hidden(image):
-    assert seen(image, moved(z_mm=10.0)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
-
-
-def test_a_target_outside_the_image_is_neither_explained_nor_impossible(image):
-    assert seen(image, moved(x_mm=200.0)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+@pytest.mark.parametrize(
+    ("shift", "expected"),
+    [
+        ({}, (1.0, 0.0, 1.0)),  # explained in full
+        ({"z_mm": -10.0}, (0.0, 1.0, 0.0)),  # in front of the measured surface: free space is violated
+        ({"z_mm": 10.0}, (0.0, 0.0, 0.0)),  # behind: may be hidden
+        ({"x_mm": 200.0}, (0.0, 0.0, 0.0)),  # outside of the image
+    ],
+)
+def test_a_target_on_in_front_of_and_behind_the_measured_surface(image, shift, expected):
+    assert seen(image, moved(**shift)) == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_surface_that_turns_its_back_is_not_explained(image):

@@ -72,17 +72,13 @@ def test_it_does_not_stand_where_the_pose_has_jumped(unsure, frames, prepared, m
     assert tracker.register(frames[1].source, prepared).proposer != "track"
 
 
-def test_it_does_not_stand_after_a_source_that_was_not_sure(unsure, frames, prepared):
+@pytest.mark.parametrize("change", [
+    {"confidence": 0.94}, {"status": RegistrationStatus.AMBIGUOUS, "T_target_source": None},
+])  # fmt: skip
+def test_it_does_not_stand_after_a_source_that_was_not_sure_or_refused(unsure, frames, prepared, change):
     tracker = unsure()
     first = tracker.register(frames[0].source, prepared)
-    tracker._remember(replace(first, confidence=0.94), frames[0].source)
-    assert tracker.register(frames[1].source, prepared).proposer != "track"
-
-
-def test_it_does_not_stand_after_a_source_that_was_refused(unsure, frames, prepared):
-    tracker = unsure()
-    first = tracker.register(frames[0].source, prepared)
-    tracker._remember(replace(first, status=RegistrationStatus.AMBIGUOUS, T_target_source=None), frames[0].source)
+    tracker._remember(replace(first, **change), frames[0].source)
     assert tracker.register(frames[1].source, prepared).proposer != "track"
 
 

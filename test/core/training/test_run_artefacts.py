@@ -181,20 +181,19 @@ def test_a_run_goes_on_with_the_bones_and_subjects_that_it_was_begun_with(tmp_pa
     assert len(provenance.entries(run)) == 2
 
 
-@pytest.mark.parametrize("content", ["{", "", "{}", "[1]"])
-def test_settings_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, content):
-    (tmp_path / "config.json").write_text(content)
-    with pytest.raises(ConfigError, match="the settings of a training run; got .*config.json .*; restore it"):
-        run_folder.check(tmp_path, TrainConfig(), ModelConfig())
-
-
-@pytest.mark.parametrize("content", ["[", "{}", '"a"', "[1]"])
-def test_provenance_that_is_damaged_is_refused_by_its_name(tmp_path, content):
-    (tmp_path / provenance.FILE).write_text(content)
-    with pytest.raises(ConfigError, match="the provenance of a training run; got .*provenance.json .*; restore it"):
-        provenance.append(tmp_path, TrainConfig(), None, 0, 1)
-    with pytest.raises(ConfigError, match="provenance.json"):
-        provenance.summary([tmp_path])
+@pytest.mark.parametrize(("file", "content", "call"), [
+    *[("config.json", content, lambda folder: run_folder.check(folder, TrainConfig(), ModelConfig()))
+      for content in ("{", "", "{}", "[1]")],
+    *[(provenance.FILE, content, call)
+      for content in ("[", "{}", '"a"', "[1]")
+      for call in (lambda folder: provenance.append(folder, TrainConfig(), None, 0, 1),
+                   lambda folder: provenance.summary([folder]))],
+])  # fmt: skip
+def test_files_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, file, content, call):
+    (tmp_path / file).write_text(content)
+    what = "settings" if file == "config.json" else "provenance"
+    with pytest.raises(ConfigError, match=f"the {what} of a training run; got .*{file} .*; restore it"):
+        call(tmp_path)
 
 
 @pytest.mark.parametrize("damage", ["random", "cut", "empty", "of something else"])

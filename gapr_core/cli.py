@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 class _Printable(logging.Formatter):
-    """Formats a line of the log without what would steer a terminal."""
+    """Formats a line of the log without control characters of a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))

@@ -1,4 +1,4 @@
-"""What is registered: a cloud or a triangle mesh in one frame."""
+"""Input of a registration: a cloud or a triangle mesh in one frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Surface:
         normals: (N, 3) float64 unit normals as read, or None.
         camera: (3,) float64, mm: where a camera saw a cloud from, if its pixels say (`geometry.pinhole`), or None.
         joined: the points were measured from several places, as several clouds or slices, or by a tip.
-        unit: that its file was read in, such as "cm"; empty for what is from no file.
+        unit: that its file was read in, such as "cm"; empty without a file.
     """
 
     points: Array
@@ -174,7 +174,7 @@ def as_array(array: Any, expected: str, how: str) -> NDArray[Any]:
     """Convert to a NumPy array; a tensor may need a gradient or live on any device.
 
     Raises:
-        InvalidPointCloudError: what cannot be one, such as rows of several lengths; with these words.
+        InvalidPointCloudError: no array, such as rows of several lengths; with these words.
     """
     if hasattr(array, "detach"):
         array = array.detach().cpu()

@@ -69,7 +69,7 @@ class Origin:
     def importing(
         self, places: Sequence[Path], names: Collection[str], stand_ins: Mapping[str, ModuleType]
     ) -> Iterator[None]:
-        """Inside, modules and packages of these names are the checkout's; outside, they are what they were.
+        """Inside, modules and packages of these names are the checkout's; outside, they are as before.
 
         Args:
             places: folders to import from.
@@ -77,7 +77,7 @@ class Origin:
             stand_ins: modules by their full names, in place of those of the checkout.
 
         Raises:
-            MethodUnavailableError: for what could not be imported.
+            MethodUnavailableError: for a failed import.
         """
         before = {name: sys.modules.pop(name) for name in _within(names)}
         sys.modules.update(stand_ins)

@@ -138,7 +138,7 @@ class Record(PairFacts, Answer, Verdict):
     facts: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; None for what is not finite. `runtime.settings.from_dict` reads it back."""
+        """Plain values; None for numbers that are not finite. `runtime.settings.from_dict` reads it back."""
         return {name: _plain(value) for name, value in asdict(self).items()}
 
 

@@ -50,8 +50,8 @@ def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Reco
     """Records in the order in which they finish.
 
     Each worker is a fresh process bound to `threads` cores, so that times can be compared and random numbers repeat.
-    When one dies (a crash inside a library), what was under way is tried again, each task alone; one that dies then
-    as well is recorded as a failure.
+    When one dies (a crash inside a library), tasks under way are tried again, each task alone; one that dies then as
+    well is recorded as a failure.
     """
     waiting = deque(tasks)
     while waiting:
@@ -79,7 +79,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Iterator[Record]:
 
 
 def _run_pool(waiting: deque[Task], jobs: int, threads: int, lost: list[Task]) -> Iterator[Record]:
-    """Take tasks off `waiting` until it is empty or the pool breaks; what was under way then goes to `lost`."""
+    """Take tasks off `waiting` until it is empty or the pool breaks; tasks under way then go to `lost`."""
     context = multiprocessing.get_context("spawn")
     under_way: dict[Future[Record], Task] = {}
     with _Environment(threads), ProcessPoolExecutor(jobs, context, _start, (context.Value("i", 0), threads)) as pool:

@@ -1,4 +1,4 @@
 """Commands of `gapr`, a module each with `add_arguments(parser)` and `run(args) -> exit code`; `cli` lists all of them.
 
-`options` and `checks` are no commands: what several share, and what `register` can know before the work.
+`options` and `checks` are no commands: shared parts, and the checks of `register` before the work.
 """

@@ -1,4 +1,4 @@
-"""An answer read back from JSON, and what made one: the keys of docs/reference/json.md."""
+"""An answer read back from JSON, and its makers: the keys of docs/reference/json.md."""
 
 from __future__ import annotations
 

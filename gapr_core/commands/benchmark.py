@@ -137,7 +137,7 @@ def benchmark(
 def _begin(
     pairs: Path, inputs: Inputs, methods: Sequence[str], out: Path, ours: str | None
 ) -> tuple[Plan, set[tuple[str, str]]]:
-    """Write the plan; hand it back with what an earlier run has done. Its records do not stay in memory."""
+    """Write the plan; hand it back with an earlier run's records. Its records do not stay in memory."""
     known = records.read(out / records.FILE)
     before = records.read_plan(out) if (out / records.PLAN).is_file() else None
     there = [record.method for record in records.sort(known, before.methods if before else methods)]

@@ -1,4 +1,4 @@
-"""What `gapr register` can know before the work: files that cannot be written, and options that do not go together."""
+"""Checks of `gapr register` before the work: files that cannot be written, and options that do not go together."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def check_collisions(inputs: list[Named], outputs: list[Named]) -> None:
 
 
 def _is_same(path: Path, other: Path) -> bool:
-    """By name, links followed, and by what is there: some file systems do not distinguish a from A."""
+    """By name, links followed, and by content: some file systems do not distinguish a from A."""
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
@@ -125,7 +125,7 @@ def naming_old_files(*paths: Path | None) -> Iterator[None]:
 
 
 def check_method(args: Namespace) -> None:
-    """Raise before the work where a method is known not to say what is asked of it.
+    """Raise before the work for a method known not to give the requested output.
 
     Raises:
         ConfigError: an option that a method of this name cannot follow.
@@ -140,7 +140,7 @@ def check_method(args: Namespace) -> None:
 
 
 def check_answer(args: Namespace, result: RegistrationResult) -> None:
-    """Raise at the end for files that could not be written, since the method did not say what they hold.
+    """Raise at the end for files that could not be written, since the method did not give their content.
 
     Raises:
         ConfigError: a pose without residuals or without a covariance, and an option that needs them.

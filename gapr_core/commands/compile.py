@@ -1,8 +1,8 @@
 """`gapr compile`: compile all loops now, so that the first registration does not wait for it.
 
-Numba keeps what it compiled, for this processor and this version of Numba: with the package, or in the user's cache
-where that folder is not writable. Whoever runs the registration should run this. A wheel that `pip install` builds from
-the sources has been through it.
+Numba keeps compiled code, for this processor and this version of Numba: with the package, or in the user's cache where
+that folder is not writable. Whoever runs the registration should run this. A wheel that `pip install` builds from the
+sources has been through it.
 """
 
 from __future__ import annotations

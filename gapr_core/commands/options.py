@@ -1,4 +1,4 @@
-"""Options that several commands share: the method, its settings, what a tracker recorded, and how files are read."""
+"""Options that several commands share: the method, its settings, a tracker's recording, and how files are read."""
 
 from __future__ import annotations
 

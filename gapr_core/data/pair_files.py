@@ -205,7 +205,7 @@ def _unreadable(path: str | Path, why: str) -> InvalidPointCloudError:
 
 
 def pair_hash(pair: Pair) -> str:
-    """sha256 of the clouds and the transform as they are written; what a frozen list is compared by."""
+    """sha256 of the clouds and the transform as they are written; by which frozen lists are compared."""
     digest = sha256()
     for key, array in sorted(_content(pair).items()):
         digest.update(f"{key}{array.shape}".encode())

@@ -26,7 +26,7 @@ class View(NamedTuple):
 
     @property
     def lying(self) -> View:
-        """The same, turned by a right angle: what is up is on the left."""
+        """The same, turned by a right angle: up is on the left."""
         x, y, z = np.cross(self.up, self.eye).tolist()
         return View(self.eye, (x, y, z))
 
@@ -53,7 +53,7 @@ class Picture:
     Attributes:
         view: the side.
         light: (H, W) 0 to 1, NaN beside the bone.
-        depth_mm: (H, W) height towards the eye of what is shown, NaN beside the bone.
+        depth_mm: (H, W) height towards the eye of the surface, NaN beside the bone.
         values: (H, W) the vertices' values there; None where none were given.
         extent_mm: left, right, bottom and top of the picture, along the axes of the view.
     """

@@ -1,1 +1,1 @@
-"""What comes from and goes to other tools: meshes, label maps, transforms, markups, tracker recordings."""
+"""Files of other tools: meshes, label maps, transforms, markups, tracker recordings."""

@@ -40,7 +40,7 @@ AXES = {"xyz": None, "lps": "lps", "ras": "ras"}  # names of three columns -> th
 
 
 class Header(NamedTuple):
-    """What stands before the first point.
+    """Lines before the first point.
 
     Attributes:
         delimiter: between two cells; None for white space.

@@ -1,6 +1,6 @@
 """The process that reads a transform with ITK: `python -m gapr_core.formats.itk_child PATH`.
 
-Its matrix goes to stdout as JSON, or null where it has none. What HDF5 says of a damaged file, or dies of, stays here.
+Its matrix goes to stdout as JSON, or null where it has none. HDF5's messages and crashes on a damaged file stay here.
 """
 
 from __future__ import annotations

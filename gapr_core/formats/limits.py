@@ -14,7 +14,7 @@ RAISE_IT = "thin the data, or raise {variable} if the file is to be trusted"
 
 @dataclass(frozen=True)
 class FileLimits:
-    """What a reader accepts. A load takes at most 20 times the unpacked data plus 200 MB of memory.
+    """Limits of a reader. A load takes at most 20 times the unpacked data plus 200 MB of memory.
 
     Attributes:
         file_mb: size of the file, MB.

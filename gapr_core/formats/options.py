@@ -1,4 +1,4 @@
-"""What a reader may be given in addition to the path."""
+"""Options of a reader in addition to the path."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ LABEL = (str, Integral)
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How to read a file; each format takes what concerns it.
+    """How to read a file; each format takes its own.
 
     Attributes:
         axes: axes of a mesh or cloud file: "lps", "ras" (turned to LPS), "as_is", "lps_to_ras" (a file in LPS, turned
-            to RAS), or "auto": what a `SPACE=` comment or columns l p s or r a s in the file say, as_is without them.
-            Those of a tracker's points as well.
+            to RAS), or "auto": the file's `SPACE=` comment or columns l p s or r a s, as_is without them. Those of a
+            tracker's points as well.
         labels: names or numbers of the segments of a label map that make up one rigid target, or one of them; none
             where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.

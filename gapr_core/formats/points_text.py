@@ -248,8 +248,9 @@ def _of_title(header: Header, count: int, has_normals: bool) -> Columns:
 def _check_first(names: list[str], values: Array) -> None:
     """Raise where the first column counts points or time, and no comment names it.
 
-    Numbers of frames have gaps, and times are no whole numbers: what rises from each of many rows to the next is one.
-    So is a whole number that never turns back, where the columns behind it are none: several points of each frame.
+    Numbers of frames have gaps, and times are no whole numbers: a column that rises from each of many rows to the next
+    is one. So is a whole number that never turns back, where the columns behind it are none: several points of each
+    frame.
     """
     if values.shape[1] <= 3 or len(names) == values.shape[1] and columns.found(names) is not None:
         return

@@ -1,4 +1,4 @@
-"""A surface from a file: one reader for each format, and one sentence for what cannot be read."""
+"""A surface from a file: one reader for each format, and one sentence for an unreadable file."""
 
 from __future__ import annotations
 

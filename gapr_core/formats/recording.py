@@ -26,7 +26,7 @@ POINT_MM, TARGET_MM = 0.7, 2.5  # radii
 
 
 def check(path: Path) -> None:
-    """Raise before the work what keeps a recording from being written.
+    """Raise before the work if a recording cannot be written.
 
     Raises:
         ConfigError: another ending than .rrd.

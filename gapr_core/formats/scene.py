@@ -1,4 +1,4 @@
-"""What a registration leaves behind for the eye: residuals of every point, and a folder that 3D Slicer opens."""
+"""Files of a registration for the eye: residuals of every point, and a folder that 3D Slicer opens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file is by its first bytes, where its name says something else."""
+"""Kinds of files by their first bytes, for misleading names."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check_packed(path: Path, ending: str) -> None:
         ending: its longest known one.
 
     Raises:
-        InvalidPointCloudError: what to unpack or to rename.
+        InvalidPointCloudError: the file to unpack or to rename.
     """
     head = _head(path)
     is_packed = head.startswith(GZIP)
@@ -56,7 +56,7 @@ def check_sequence(path: Path, ending: str) -> None:
     """Raise for a recording by PLUS under the ending of a label map.
 
     Raises:
-        InvalidPointCloudError: what to rename it to.
+        InvalidPointCloudError: its new name.
     """
     if ending in SEQUENCE_HINTS and SEQUENCE in _head(path, SEQUENCE_BYTES):
         given, how = f"{path.name}, a recording by PLUS", f"{SEQUENCE_HINTS[ending]}, and give --tip"

@@ -1,4 +1,4 @@
-"""Numbers in text files: few bytes of memory for each, and no guess about what is missing."""
+"""Numbers in text files: few bytes of memory for each, and no guess about missing ones."""
 
 from __future__ import annotations
 

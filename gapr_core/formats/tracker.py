@@ -38,7 +38,7 @@ MOST_NAMES, LONGEST_NAME = 8, 40  # of the tools that an error lists, and charac
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """What a pivot calibration finds.
+    """Answer of a pivot calibration.
 
     Attributes:
         tip_mm: (3,) the tip in the frame of the tool's marker.

@@ -9,7 +9,7 @@ from gapr_core.model.pairs import Pairs
 
 
 class PairEncoding:
-    """What geometry adds to attention. This one adds nothing: vanilla attention is the identity of all four hooks.
+    """Part of attention that geometry adds. This one adds nothing: vanilla attention is the identity of all four hooks.
 
     Heads are blocks of channels: `blocks` are (B, n, H, C) queries or values, of which head h owns the h-th block of
     channels and the rest is zero (queries) or ignored (values).

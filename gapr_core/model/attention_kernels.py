@@ -23,9 +23,8 @@ def forward(q, k, v, folded, first, bias, index, valid, geometry, scale, out, mi
     """Fill out (N, H, D), mixed (N, H, E) and weights (N, H, K), all zero before.
 
     Args:
-        q: (N, H, D). k, v: (M, H, D). folded: (N, H, E), what multiplies the hidden layer in the logits.
-        first, bias: (G, E), (E,) of the hidden layer.
-        index, valid: (N, K) rows of the keys, and bool, which exist. geometry: (N, K, G).
+        q: (N, H, D). k, v: (M, H, D). folded: (N, H, E), factors of the hidden layer in the logits. first, bias: (G,
+        E), (E,) of the hidden layer. index, valid: (N, K) rows of the keys, and bool, which exist. geometry: (N, K, G).
         scale: multiplies the logits.
     """
     hidden = np.empty((index.shape[1], len(bias)), np.float32)
@@ -54,7 +53,7 @@ def backward(
     q, k, v, folded, first, bias, index, valid, geometry, scale, weights, g_out, g_mixed,
     g_q, g_k, g_v, g_folded, g_first, g_bias,
 ):  # fmt: skip
-    """Add to the gradients `g_*`, shaped like what they belong to, what `g_out` and `g_mixed` say."""
+    """Add to the gradients `g_*`, of the shapes of their arrays, the share of `g_out` and `g_mixed`."""
     hidden = np.empty((index.shape[1], len(bias)), np.float32)
     g_logit = np.empty((index.shape[1], q.shape[1]), np.float32)
     g_hidden = np.empty(len(bias), np.float32)

@@ -29,8 +29,7 @@ def attend(
 
     Args:
         q: (N, H, D) queries. k, v: (M, H, D) keys and values.
-        folded: (N, H, E), what multiplies the hidden layer in the logits.
-        first, bias: (G, E), (E,) of the hidden layer.
+        folded: (N, H, E), factors of the hidden layer in the logits. first, bias: (G, E), (E,) of the hidden layer.
 
     Returns:
         (N, H, D) sums of values, (N, H, E) sums of hidden layers.

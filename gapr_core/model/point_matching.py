@@ -125,7 +125,7 @@ def log_optimal_transport(scores: Tensor, dustbin: Tensor, valid_p: Tensor, vali
 def _scale(log_z: Tensor, mu: Tensor, nu: Tensor, rounds: int) -> Tensor:
     """Further rounds as plain scalings of exp(log_z): after one round in log space all its entries are at most 1.
 
-    The same iteration as in log space, at a tenth of the cost; what underflows is below 1e-38 of a point's mass.
+    The same iteration as in log space, at a tenth of the cost; underflow is below 1e-38 of a point's mass.
     """
     kernel = log_z.clamp(min=_LOWEST).exp()
     transposed = kernel.transpose(1, 2).contiguous()

@@ -11,7 +11,7 @@ FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @numba.njit(**FAST)
 def balls(centres, support, distance, index, radius, small, valid, c_h, c_k):
-    """Fill valid (N, K) and the centroids of both balls (N, 3); `index` of what lies outside becomes 0.
+    """Fill valid (N, K) and the centroids of both balls (N, 3); `index` of points outside becomes 0.
 
     The nearest support point (M, 3) of a centre (N, 3) always counts, `small` is the radius of the smaller ball.
     """

@@ -1,4 +1,4 @@
-"""What flows through the network: clouds with their pyramid, and matches."""
+"""Data of the network: clouds with their pyramid, and matches."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Features:
-    """What the backbone made of a cloud: `fine` (N, C_fine) of its fine points, `coarse` (S, C) of its superpoints."""
+    """Backbone features of a cloud: `fine` (N, C_fine) of its fine points, `coarse` (S, C) of its superpoints."""
 
     fine: Tensor
     coarse: Tensor

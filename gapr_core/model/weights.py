@@ -29,7 +29,7 @@ def save(
     Args:
         network: what to write.
         path: `*.safetensors`.
-        card: what it was trained on, licences, splits, results: anything that JSON takes.
+        card: its training data, licences, splits, results: anything that JSON takes.
         dtype: float32, or float16 for half the size.
     """
     tensors = {name: t.detach().to("cpu", dtype).contiguous() for name, t in network.state_dict().items()}

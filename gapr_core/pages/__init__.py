@@ -1,1 +1,1 @@
-"""What users look at: reports, plots and pictures."""
+"""Output for users: reports, plots and pictures."""

@@ -1,4 +1,4 @@
-"""Pictures of what a camera saw, and of which points were taken for bone: for a page, and as one poster."""
+"""Pictures of a camera's view, and of points taken for bone: for a page, and as one poster."""
 
 from __future__ import annotations
 

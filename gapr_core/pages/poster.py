@@ -37,7 +37,7 @@ def save_poster(
         distances_mm: (N,) their signed distances from the surface.
         title: the line above.
         charts: name to (values, limit): small charts under the bone; not finite where there is no value.
-        x_title: what the charts run over, counted from 1.
+        x_title: unit of the charts' x axis, counted from 1.
     """
     figure = Figure(figsize=(11.0, 6.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)

@@ -22,7 +22,7 @@ class Image:
 
     Attributes:
         png: its bytes; None where there is none, which is said in its place.
-        name: what it shows, for those who cannot see it.
+        name: text for readers who cannot see the image.
         caption: a line below.
         is_bad: the caption reports a mistake.
     """

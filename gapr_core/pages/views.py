@@ -1,4 +1,4 @@
-"""The bone from several sides, and on it what was measured: the picture of pages, notebooks and posters."""
+"""The bone from several sides, with the measured points: the picture of pages, notebooks and posters."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ MOST_POINTS = 3000  # drawn of a cloud
 
 @dataclass(frozen=True, eq=False)
 class OnBone:
-    """What is drawn, target frame, mm.
+    """Parts of a drawing, target frame, mm.
 
     Attributes:
         bone: the bone.
         points: (N, 3) measured points.
         distance_mm: (N,) their signed distances to the bone; NaN is drawn grey.
         targets: (K, 3) places that are numbered.
-        gain: what a further look at each place of the bone would bring, as its colour; None for a plain bone.
+        gain: gain of a further look at each place of the bone, as its colour; None for a plain bone.
         newest: (M, 3) points of the last look.
     """
 

@@ -1,4 +1,4 @@
-"""What a registration answers: a pose with its certainty, or a refusal with its reason; what check points say of it."""
+"""Answers of a registration: a pose with its certainty, or a refusal with its reason; the verdict of check points."""
 
 from gapr_core.results.parts import (
     Effect,

@@ -13,12 +13,12 @@ Array = NDArray[np.float64]
 
 
 def confidence_text(confidence: float) -> str:
-    """Two decimals, rounded down: no 1.00 for what is not certain, no 0.90 for what does not reach it."""
+    """Two decimals, rounded down: never 1.00 without certainty, never 0.90 below it."""
     return f"{np.floor(100.0 * confidence + 1e-9) / 100.0:.2f}"
 
 
 class RegistrationStatus(str, Enum):
-    """What the data decided. Only `OK` carries a pose."""
+    """Decision of the data. Only `OK` carries a pose."""
 
     OK = "OK"
     AMBIGUOUS = "AMBIGUOUS"  # a distinct pose explains the source as well, or the bone is in it twice
@@ -232,7 +232,7 @@ class LookFit(str, Enum):
 
 
 class LookAnswer(NamedTuple):
-    """What a registration says of one look.
+    """Answer of a registration for one look.
 
     Attributes:
         viewpoint: (3,) mm, source frame: where the camera was.

@@ -1,4 +1,4 @@
-"""What check points say of an accepted pose."""
+"""Verdict of check points on an accepted pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class Verdict(str, Enum):
-    """What the check points say of a pose."""
+    """Verdict of the check points on a pose."""
 
     HOLDS = "HOLDS"  # they lie where they should, and an error that matters would have shown, and did not
     SAYS_LITTLE = "SAYS_LITTLE"  # they lie where they should, but such an error might not show in them

@@ -1,4 +1,4 @@
-"""The answer to one registration: what it holds, and how it is shown and written."""
+"""The answer to one registration: its parts, and how it is shown and written."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class RegistrationResult:
             unless `OK`, and where a method does not say.
         proposer: name of the last proposer that was asked; empty where nothing was registered.
         rounds: rounds of proposals: of how many proposers, of a camera's cloud of how many sets of regions.
-        features: what the confidence is computed from, by name.
+        features: input of the confidence, by name.
         contributions: log odds that each feature adds to the confidence, by name: above 0 it speaks for the pose.
         residuals: of every used point under the best hypothesis; None where a method does not say.
         inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone

@@ -11,7 +11,7 @@ PACKAGES = Path(__file__).resolve().parents[2]  # the folder that gapr_core is i
 
 
 def run(module: str, *arguments: str, timeout_s: float | None = None) -> subprocess.CompletedProcess[str]:
-    """`python -m module arguments` with what it printed; nothing of the caller's working folder is imported.
+    """`python -m module arguments` with its output; nothing of the caller's working folder is imported.
 
     Python looks there first: a file of its user's, such as `random.py`, would be run in place of its own.
 

@@ -36,9 +36,9 @@ def outcomes(
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Give every task with the result or the error of its call, in the order in which they finish.
 
-    A worker gets several short tasks at a time, and hands back what it does not begin within `TURN_S`. When three
-    workers have died of such a turn, each of its tasks is tried alone; when three have died of one task, its outcome
-    is a `WorkersDiedError`.
+    A worker gets several short tasks at a time, and hands back tasks not begun within `TURN_S`. When three workers have
+    died of such a turn, each of its tasks is tried alone; when three have died of one task, its outcome is a
+    `WorkersDiedError`.
 
     Args:
         address: of the scheduler.

@@ -13,7 +13,7 @@ STEERING = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 
 
 def printable(text: str) -> str:
-    """Escape what would steer a terminal: names in files, and of files, may hold it."""
+    """Escape control characters of a terminal: names in files, and of files, may hold it."""
     return STEERING.sub(lambda found: repr(found[0])[1:-1], text)
 
 

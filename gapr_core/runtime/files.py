@@ -23,7 +23,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Give a hidden file next to `path` to write; it replaces `path` if the block ends well.
 
     After an error the old file is as it was. Missing folders are made. A file that is replaced keeps its permissions. A
-    link stays, and what it leads to is replaced; a device or a pipe, such as /dev/null, gets the content.
+    link stays, and its target is replaced; a device or a pipe, such as /dev/null, gets the content.
 
     Raises:
         ConfigError: the file cannot be written: no such folder, no permission, a full disk.
@@ -201,7 +201,7 @@ def read_json(path: str | Path, expected: str, how: str = "check the path, or ma
 
     Args:
         path: where it is.
-        what: what the file should be, in words, for the error.
+        expected: the file's kind, in words, for the error.
         how: to get it, in words, for the error.
 
     Raises:

@@ -36,7 +36,7 @@ def setting(
         low, high: ends of the range, both included; None where there is no end.
         unit: of the value; empty for counts and shares.
         choices: of a text; empty for any.
-        more: what another reader of the field needs, such as whether a ROS parameter may change at run time.
+        more: facts for other readers of the field, such as whether a ROS parameter may change at run time.
     """
     metadata = {"text": text, "low": low, "high": high, "unit": unit, "choices": tuple(choices), **more}
     if isinstance(default, dict | list):
@@ -94,7 +94,7 @@ def _of_type(hint: Any, value: Any, name: str) -> Any:
 
 
 def why_not(of: Field, value: Any) -> str:
-    """Say what a value of a field must be; empty if it is."""
+    """Name the range or choices that a value of a field misses; empty if none."""
     choices, low, high = (of.metadata.get(key) for key in ("choices", "low", "high"))
     if choices and value not in choices:
         return f"one of {', '.join(choices)}"
@@ -120,7 +120,7 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
     Args:
         cls: the dataclass; its annotations decide the types. Lists become tuples, whole numbers floats.
         values: a mapping of names to values.
-        path: what stands before the names in an error.
+        path: prefix of the names in an error.
 
     Raises:
         ConfigError: a name that the dataclass does not have, a value of another type or out of range, or a missing one.
@@ -279,7 +279,7 @@ def _has_default(of: Field) -> bool:
 
 
 def _is_within(number: Any, low: float | None, high: float | None) -> bool:
-    """NaN, and what is no number, is not."""
+    """Tell whether a value is a number within the ends; NaN is not."""
     if not isinstance(number, int | float):
         return False
     return number >= (float("-inf") if low is None else low) and number <= (float("inf") if high is None else high)

@@ -20,6 +20,6 @@ class ShortProfile(WorkerPlugin):
     idempotent = True  # one of this name for a cluster
 
     def setup(self, worker: Worker) -> None:
-        """Shorten what was kept so far, and what is kept from now on; a worker makes one entry each second."""
+        """Shorten the profile so far, and from now on; a worker makes one entry each second."""
         worker.profile_history = deque(worker.profile_history, maxlen=SECONDS)
         worker.profile_keys_history = deque(worker.profile_keys_history, maxlen=SECONDS)

@@ -35,7 +35,7 @@ LEGEND_LETTERS = 160  # that fit into a line of the picture
 
 @dataclass(frozen=True)
 class Run:
-    """What a run has written so far: its name, log.csv, and validation.csv by protocol."""
+    """Files of a run so far: its name, log.csv, and validation.csv by protocol."""
 
     name: str
     steps: Table
@@ -114,7 +114,7 @@ def _parse(head: list[str], line: str) -> dict[str, float | str] | None:
 
 
 def _latest(rows: list[dict[str, float | str]]) -> list[dict[str, float | str]]:
-    """Without what was done again after an older checkpoint was taken up."""
+    """Drop rows done again after an older checkpoint."""
     kept: list[dict[str, float | str]] = []
     for row in rows:
         while kept and kept[-1]["pairs"] >= row["pairs"]:  # type: ignore[operator]

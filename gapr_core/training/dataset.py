@@ -78,7 +78,7 @@ class People:
 
 @dataclass(frozen=True, eq=False)
 class SampledOnce(Specimen):
-    """A bone of which every sample is one and the same: what a protocol crops are the target's own points."""
+    """A bone of which every sample is one and the same: a protocol crops the target's own points."""
 
     cloud: Array | None = None
 
@@ -207,7 +207,7 @@ def check_mix(mix: Mapping[str, float]) -> None:
 
 
 def prune(folder: Path, train: TrainConfig, pairs: int) -> None:
-    """Delete what the cache holds for pairs before number `pairs`."""
+    """Delete the cache's bones of pairs before number `pairs`."""
     bone_cache.prune(folder, LANES * _oldest_row(train, pairs))
 
 

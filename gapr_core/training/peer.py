@@ -38,7 +38,7 @@ Log = list[dict[str, float]]
 
 
 class Lessons(Protocol):
-    """What a network learns from a pair.
+    """Lessons of a network from a pair.
 
     Attributes:
         names: of what a pair gives and the log keeps; the first is the loss.
@@ -74,7 +74,7 @@ class WithVoxel(TrainingPairs):
 
 
 def main(description: str, checkout: type[Checkout], teacher: Teacher) -> int:
-    """Train, or go on, as the command line says; 1 for what cannot be trained with."""
+    """Train, or go on, as the command line says; 1 for settings without a training."""
     parser = ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--checkout", type=Path, required=True, help="folder of the authors' code")
     parser.add_argument(

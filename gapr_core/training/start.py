@@ -1,4 +1,4 @@
-"""What a run starts with: its weights, and their optimiser."""
+"""Start of a run: its weights, and their optimiser."""
 
 from __future__ import annotations
 

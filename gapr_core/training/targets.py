@@ -1,4 +1,4 @@
-"""What the network should have said: overlaps of patches and matches of fine points under the true motion."""
+"""True answers for the network: overlaps of patches and matches of fine points under the true motion."""
 
 from __future__ import annotations
 

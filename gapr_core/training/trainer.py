@@ -100,11 +100,11 @@ class Run:
 
     @property
     def leads(self) -> bool:
-        """True in the process that writes what the run has one of."""
+        """True in the process that writes the run's shared files."""
         return self.group.rank == 0
 
     def go_on(self, minutes: float) -> None:
-        """Steps until the schedule ends or `minutes` are over; what is on disk is up to date then."""
+        """Steps until the schedule ends or `minutes` are over; files on disk are up to date then."""
         begun, earlier = time.monotonic(), self.state["seconds"]
         to_validate, to_save = Interval(self.config.validate_minutes), Interval(self.config.checkpoint_minutes)
         ahead = range(self.state["step"], self.steps)
@@ -135,7 +135,7 @@ class Run:
                 break
 
     def leave(self) -> None:
-        """Delete what the processes shared, once the schedule has ended."""
+        """Delete the processes' shared files, once the schedule has ended."""
         if self.bones and self.leads and self.state["step"] == self.steps:
             shutil.rmtree(self.bones, ignore_errors=True)
 

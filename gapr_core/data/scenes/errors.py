@@ -1,7 +1,7 @@
-"""Wounds as a stereo camera sees them, and bones under layers: what `camera.measured` leaves out.
+"""Wounds as a stereo camera sees them, and bones under layers: errors beyond `camera.measured`.
 
 A stereo camera matches depth over windows, so ridges are round, and near pixels err alike. Along edges pixels fly
-between what is before and behind. Wet spots give nothing. Depth comes in steps.
+between front and back. Wet spots give nothing. Depth comes in steps.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class SceneLevel:
         packed: the wound has walls and a floor of tissue; else the limb is a thin skin.
         things: other things that lie there.
         whole_image: the source is all that the camera sees; else a region about the wound.
-        errors: of the camera, and of what lies on the bone.
+        errors: of the camera, and of layers on the bone.
     """
 
     bone_share: tuple[float, float] = (0.10, 0.90)

@@ -61,7 +61,7 @@ def look(specimen: Specimen, share: tuple[float, float], share_of: str, draws: i
 
 
 def tangents(view: View) -> tuple[Array, Array]:
-    """Two unit directions (3,) across the look: along the longer extent of what is seen, and across it."""
+    """Two unit directions (3,) across the look: along the longer extent of the seen points, and across it."""
     flat = view.points - view.points.mean(axis=0)
     flat = flat - np.outer(flat @ view.towards, view.towards)
     along = np.linalg.eigh(flat.T @ flat)[1][:, 2]

@@ -1,6 +1,6 @@
 """The process that reads a label map with native libraries: `python -m gapr_core.formats.volumes.child REQUEST OUT`.
 
-What it finds goes to OUT as .npz: the voxels of the segments (cropped), where they lie, and notes. When ITK or a codec
+The answer goes to OUT as .npz: the voxels of the segments (cropped), where they lie, and notes. When ITK or a codec
 dies of a damaged file, only this process ends.
 """
 
@@ -28,7 +28,7 @@ LIBRARIES_BYTES = 4 << 30  # address space that they reserve
 
 
 def main(request: str, out: str) -> int:
-    """Read what the request names; a refusal goes to stdout as JSON, with exit code 1."""
+    """Read the request's labels; a refusal goes to stdout as JSON, with exit code 1."""
     asked = json.loads(request)
     limits = FileLimits(**asked["limits"])
     _limit(limits, asked["seconds"])

@@ -1,4 +1,4 @@
-"""Which segment is meant: names out of headers, numbers with what they stand for."""
+"""Which segment is meant: names out of headers, numbers with their meaning."""
 
 from __future__ import annotations
 

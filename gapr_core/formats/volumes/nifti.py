@@ -1,4 +1,4 @@
-"""What ITK does not check or say of a NIfTI file: its length, both its places, and the names in its extended header."""
+"""Checks of NIfTI files beyond ITK's: its length, both its places, and the names in its extended header."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a header says where its voxels lie: what is missing or contradicts itself is no guess of ours.
+"""Whether a header says where its voxels lie: missing or contradictory entries are refused, never guessed.
 
 ITK fills in the origin and axes that a header lacks, ignores the unit of NRRD and takes one of two places of NIfTI.
 """

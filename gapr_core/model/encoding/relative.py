@@ -39,7 +39,7 @@ class RelativeEncoder(nn.Module):
         return RelativeEncoding(hidden, self.to_key.weight @ self.second.weight, self.to_value)
 
     def folded(self, q: Tensor) -> Tensor:
-        """(N, H, hidden), what multiplies the hidden layer in the logits, from queries (N, H, D)."""
+        """(N, H, hidden), factors of the hidden layer in the logits, from queries (N, H, D)."""
         key_map = (self.to_key.weight @ self.second.weight).view(*q.shape[1:], -1)
         return (q.transpose(0, 1) @ key_map).transpose(0, 1)
 

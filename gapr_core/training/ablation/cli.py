@@ -86,7 +86,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Train and examine what is missing, and say where the table is."""
+    """Train and examine missing networks, and print the table's place."""
     config = replace(TrainConfig.from_yaml(args.config) if args.config else TrainConfig(), pairs=args.pairs)
     plan = read_plan(args.plan or default_plan())
     origin = "anatomy" if args.anatomy else "parametric"
@@ -172,7 +172,7 @@ def finish_all(tasks: Sequence[Task], jobs: int) -> Iterator[bool]:
 
 
 def finish_quietly(task: Task, threads: int) -> bool:
-    """`finish` in a process next to others; what it says goes to output.log in the task's folder."""
+    """`finish` in a process next to others; its output goes to output.log in the task's folder."""
     torch.set_num_threads(threads)
     task.folder.mkdir(parents=True, exist_ok=True)
     with (task.folder / "output.log").open("a") as file, redirect_stderr(file), redirect_stdout(file):

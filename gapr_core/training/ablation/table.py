@@ -64,7 +64,7 @@ def row(variant: Variant, protocol: str, folders: Sequence[Path]) -> Record:
 def difference(variant: Variant, last: Variant, protocol: str, folders: Mapping[Variant, Sequence[Path]]) -> Record:
     """Subtract the last network of its table, on the same pairs with the same seeds.
 
-    As `row`: means with 95 % intervals over subjects. Paired, so that what is hard for both says nothing.
+    As `row`: means with 95 % intervals over subjects. Paired, so that pairs hard for both cancel.
     """
     both = [pair for pair in zip(folders[variant], folders[last], strict=True)
             if all((folder / "exam.json").exists() for folder in pair)]  # fmt: skip

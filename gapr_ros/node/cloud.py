@@ -72,19 +72,6 @@ def plain_frame(frame_id: str) -> str:
     return frame_id.lstrip("/")
 
 
-def check_frame(frame: str, model_frame: str) -> None:
-    """Refuse a cloud in no frame at all, and one in that of the bone.
-
-    Raises:
-        RefusedError: bad_frame.
-    """
-    if not frame:
-        raise RefusedError(Reason.BAD_FRAME, "the cloud has no frame_id: a pose in no frame means nothing")
-    if frame == model_frame:
-        text = f"the cloud is in '{frame}', which is the bone's own frame: set model_frame, or the driver's frame_id"
-        raise RefusedError(Reason.BAD_FRAME, text)
-
-
 def take_in(
     cloud: PointCloud2, model_extent_mm: float, parameters: NodeParameters, T_crop_cloud: Array | None = None
 ) -> Taken:

@@ -218,7 +218,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _play(bag: Bag, options: ReplayOptions) -> int:
-    node = Node("bag_replay")
+    node = Node("bag_replay", enable_rosout=False)  # its last line comes after Ctrl-C has shut rclpy down
     for topic, why in bag.skipped.items():
         node.get_logger().warning(f"{topic} is left out: {why}")
     try:

@@ -113,7 +113,7 @@ def markdown(rows: Sequence[Record], apart: Sequence[Record], pictures: dict[str
         for protocol in dict.fromkeys(r["protocol"] for r in own):
             has_paper = any(r["paper_rr_percent"] for r in own if r["protocol"] == protocol)
             head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if has_paper else [])]
-            lines = [_cells(r, has_paper) for r in own if r["protocol"] == protocol]
+            lines = [_row(r, has_paper) for r in own if r["protocol"] == protocol]
             count = max(r["pairs"] for r in own if r["protocol"] == protocol)
             parts += [f"Protocol {protocol}, {count} pairs", table_of(head, lines)]
             compared = [r for r in apart if (r["table"], r["protocol"]) == (table, protocol) and r["pairs"]]
@@ -138,7 +138,7 @@ def _preamble(settings: Record) -> str:
     )
 
 
-def _cells(r: Record, has_paper: bool) -> list[str]:
+def _row(r: Record, has_paper: bool) -> list[str]:
     on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
     return [r["network"], *_cells(r, ".1f"), *(on_paper if has_paper else [])]
 

@@ -8,7 +8,8 @@ import tiny
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration.checks.assess import assess_fit
+from gapr_core.registration.checks import assess
+from gapr_core.registration.checks.assess import assess_fit, follows_both_cortices
 from gapr_core.registration.checks.assessment import shared_probability
 from gapr_core.registration.confidence.classifier import Classifier, bone_probability
 from gapr_core.registration.confidence.features import BONE
@@ -144,3 +145,19 @@ def test_a_fit_is_assessed_by_its_covariance_and_features(a):
     np.testing.assert_array_equal(found.uncertainty.covariance, expected.covariance)
     assert found.judgement == classifier.judge(BONE, found.features) and found.other_bone_prior == 0.2
     assert found.refusal.check == "unobserved turn" and found.refusal.status is RegistrationStatus.DEGENERATE
+
+
+@pytest.mark.parametrize(("both_mm", "own_mm", "flatness_mm", "follows"), [
+    (0.40, 0.5, 0.3, True), (0.42, 0.5, 0.3, False), (0.40, 0.5, 0.26, False), (0.22, 0.5, 0.1, True),
+    (0.23, 0.5, 0.1, False),
+])  # fmt: skip
+def test_a_source_follows_both_cortices_where_they_leave_nothing_but_its_noise(
+    a, monkeypatch, both_mm, own_mm, flatness_mm, follows
+):
+    """Less than .82 of the residuals of the outer one, and 1.5 of the noise, which is .15 mm at least."""
+    assert not follows_both_cortices(a, CONFIG), "a bone of one surface"
+    hollow = replace(a.target, both_cortices=a.target)
+    source = replace(a.source, flatness_mm=np.full(len(a.source.points), flatness_mm))
+    monkeypatch.setattr(assess, "evaluate", lambda *_: replace(a.fit, sigma_mm=both_mm))
+    seen = replace(a, target=hollow, source=source, fit=replace(a.fit, sigma_mm=own_mm))
+    assert follows_both_cortices(seen, CONFIG) is follows

@@ -81,7 +81,8 @@ def test_each_check_refuses_alone_beyond_its_threshold(egg, change, check, statu
 
 
 def test_a_finding_holds_the_statistic_and_its_threshold(egg):
-    changes = {loose(turn_deg=7.0): (7.0, 6.0), loose(shift_mm=8.0): (8.0, 5.0), mirrored(-0.5): (-0.5, -0.01)}
+    changes = {loose(turn_deg=7.0): (7.0, 6.0), loose(shift_mm=8.0): (8.0, 5.0), mirrored(-0.5): (-0.5, -0.01),
+               rivalled(4.0, 4.05): (1.0125, 1.015)}  # fmt: skip
     for change, expected in changes.items():
         finding = checked_geometry(change(egg), CONFIG).refusal
         assert (finding.statistic, finding.threshold) == pytest.approx(expected)

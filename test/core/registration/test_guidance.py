@@ -128,7 +128,7 @@ def test_a_stand_off_excludes_no_rival_that_fits_as_well(distal):
     for target in (distal.target, off):
         there = replace(distal, target=target)
         members = [np.flatnonzero(np.linalg.norm(target.points - target.points[k], axis=1) < 15.0) for k in (0, 500)]
-        patches = guidance.Patches(np.array([0, 500]), members)
+        patches = dict(zip((0, 500), members, strict=True))
         excluded = guidance._of_rivals(there, [same], patches, 0.8, 0.7)[2]
         assert excluded.max() < 0.02
 

@@ -184,10 +184,10 @@ def _forked(session: Any, module: str, text: str, line: int, limit_s: int) -> tu
         os.close(reading)
         _run(session, module, text, line, limit_s, writing)
     os.close(writing)
-    with os.fdopen(reading) as outcome:
-        text = outcome.read()
+    with os.fdopen(reading) as file:
+        outcome = file.read()
     _, status, used = os.wait4(child, 0)
-    return text, status != 0, used.ru_utime + used.ru_stime
+    return outcome, status != 0, used.ru_utime + used.ru_stime
 
 
 def _run(session: Any, module: str, text: str, line: int, limit_s: int, writing: int) -> None:

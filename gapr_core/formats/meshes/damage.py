@@ -27,7 +27,7 @@ def _odd_faces(mesh: Surface) -> int:
     keys = edges[..., 0] * len(mesh.points) + edges[..., 1]
     _, number, count = np.unique(keys, return_inverse=True, return_counts=True)
     faces = int(((count != 2)[number].reshape(-1, 3).sum(axis=1) >= 2).sum())
-    return faces if (count != 2).sum() <= EDGES * faces else 0
+    return faces if (count != 2).sum() <= EDGES * (faces + 1) else 0
 
 
 def _spikes(mesh: Surface) -> int:

@@ -225,13 +225,13 @@ def test_a_pose_of_the_examination_agrees_with_what_lies_within_one_and_a_half_m
     config = toy.small_config(superpoints=(10, 20), width=8, global_width=16)
     target = toy.bone(600)
     pair = Pair(toy.view(target), target, np.eye(4), "a", "femur", "p1", "paper")
-    propose, radii_mm = ablation.consensus, []
+    propose, radii_mm = ablation.local_to_global, []
 
-    def heard(pose, found, radius_mm):
+    def heard(found, radius_mm):
         radii_mm.append(radius_mm)
-        return propose(pose, found, radius_mm)
+        return propose(found, radius_mm)
 
-    monkeypatch.setattr(ablation, "consensus", heard)
+    monkeypatch.setattr(ablation, "local_to_global", heard)
     record = ablation.examine(GAPRNet(config).eval(), pair)
     assert record["pair"] == "a" and set(ablation_table.FIGURES) <= record.keys()
     frame = target_frame(target, config)

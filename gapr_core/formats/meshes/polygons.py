@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import NDArray
 
+log = logging.getLogger(__name__)
 Indices = NDArray[np.int64]
 
 
@@ -33,6 +36,8 @@ def fans(offsets: Indices, corners: Indices) -> Indices:
     sizes = _sizes(offsets, corners)
     if len(sizes) and (sizes == 3).all():
         return corners.reshape(-1, 3)
+    if (sizes < 3).any():
+        log.warning("a mesh has %d polygons of fewer than three corners, which are left out", (sizes < 3).sum())
     triangles = np.maximum(sizes - 2, 0)
     start = np.repeat(offsets[:-1], triangles)
     step = np.arange(len(start)) - np.repeat(np.cumsum(triangles) - triangles, triangles)

@@ -294,3 +294,10 @@ def test_faces_that_share_no_vertices_are_no_damage(tmp_path, caplog, femur):
     np.savez(tmp_path / "bone.npz", points=corners, faces=np.arange(len(corners)).reshape(-1, 3))
     reading.read(tmp_path / "bone.npz")
     assert not caplog.text
+
+
+def test_polygons_of_two_corners_are_left_out_with_a_warning(tmp_path, caplog):
+    """One damaged digit of an offset takes a corner from a polygon and gives it to the next."""
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 50 0 0\nv 0 50 0\nv 0 0 50\nf 1 2\nf 1 2 3\nf 1 3 4 2\n")
+    assert len(reading.read(tmp_path / "a.obj").triangles) == 3
+    assert "1 polygons of fewer than three corners" in caplog.text

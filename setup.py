@@ -87,7 +87,8 @@ class BuildCompiled(build_py):
         }
         command = [sys.executable, "-m", "gapr_core.cli", "compile"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-        wheel = self.distribution.command_obj.get("bdist_wheel")
+        asked = "bdist_wheel" in self.distribution.commands  # it may come after `build`
+        wheel = self.distribution.get_command_obj("bdist_wheel", create=asked)
         if done.returncode or not list(folder.rglob("*.nbc")):
             why = done.stderr.strip().splitlines()[-1:]
             self.warn(f"the loops are not compiled, so the first registration takes half a minute: {why}")

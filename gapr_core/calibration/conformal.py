@@ -20,8 +20,7 @@ from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATU
 Array = NDArray[np.float64]
 MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom
 MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square, for two to three effective directions
-COVERED = 0.955  # of the errors in a bin: a little above the required 95 %
-IN_EACH = 0.935  # of the errors of each sensor family in a bin
+COVERED = 0.95  # of the errors in a bin, and of each sensor family in it
 BINS = (0.5, 0.8, 0.9, 0.97, 1.0)  # edges of the confidence
 FEWEST = 30  # least answers of a bin, or of a family in it
 
@@ -72,7 +71,7 @@ def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple
         if in_bin.sum() < FEWEST:
             continue
         families = [in_bin & (family == name) for name in np.unique(family[in_bin])]
-        of_each = [conformal_quantile(scores[of_it], IN_EACH) for of_it in families if of_it.sum() >= FEWEST]
+        of_each = [conformal_quantile(scores[of_it], COVERED) for of_it in families if of_it.sum() >= FEWEST]
         at.append(high)
         found.append(max([conformal_quantile(scores[in_bin], COVERED), *of_each]))
     return tuple(at), tuple(np.maximum.accumulate(found[::-1])[::-1])

@@ -45,7 +45,11 @@ def read_npz(path: Path, options: ReadOptions) -> Surface:
         ValueError: faces that are no integers.
     """
     limits = options.limits
-    with zipfile.ZipFile(io.BytesIO(limits.read(path))) as archive:
+    data = limits.read(path)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        end = data.rfind(b"PK\5\6") + 10  # says how many arrays there are: a damaged list may skip one
+        if len(archive.infolist()) != int.from_bytes(data[end : end + 2], "little"):
+            raise ValueError("a list of its arrays that is damaged")
         names = {name.removesuffix(".npy"): name for name in archive.namelist()}
         if "points" not in names:
             given = f"only {', '.join(names) or 'nothing'}"

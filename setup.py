@@ -61,7 +61,9 @@ def files(folder, *patterns):
 
 def readme():
     """The README with links that hold outside of the repository."""
-    return re.sub(r"\]\((?!\w+:|#)", f"]({URL}/blob/main/", (HERE / "README.md").read_text(encoding="utf-8"))
+    text = (HERE / "README.md").read_text(encoding="utf-8")
+    text = re.sub(r"(!\[[^\]]*\]\()(?!\w+:)", rf"\1{URL}/raw/main/", text)
+    return re.sub(r"\]\((?!\w+:|#)", f"]({URL}/blob/main/", text)
 
 
 class BuildCompiled(build_py):

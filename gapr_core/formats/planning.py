@@ -98,7 +98,7 @@ def distances_mm(points: Array, bone: Surface) -> Array:
 def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> tuple[ResultWarning, ...]:
     """Warn of planned targets (N, 3) far from the bone, or all at its frame's origin, with the likely mistake."""
     far = apart_mm > FAR_MM
-    if result.bone is None:
+    if result.bone is None or not len(points):
         return ()
     if not far.any():
         size_mm = float(np.abs(points).max())

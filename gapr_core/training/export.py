@@ -30,6 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
     args = parser.parse_args(arguments)
     if args.run.is_file():
+        if args.licences is not None:
+            parser.error("a file of weights keeps its card: leave --licences out")
         digest = weights.sign(args.run, args.out)
     else:
         network, trained = weights.load(args.run / "weights.safetensors")

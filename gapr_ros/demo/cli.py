@@ -1,4 +1,4 @@
-"""The node registers simulated clouds of a bone; a table and a report hold its poses against the truth.
+"""`gapr demo`: the node registers simulated clouds of a bone; a table and a report hold its poses against the truth.
 
 A probe sweeps along the bone. With --scene a camera circles a wound; with --guided a probe goes where the node says
 that a look would help most. With --real DIR public real clouds are registered instead, without the node;

@@ -314,3 +314,7 @@ def test_a_method_whose_module_is_not_found_is_answered_with_where_to_put_it(fol
     words = ["register", "--source", "cloud.npy", "--target", "cloud.npy", "--method", "mine_alone:make"]
     assert cli.main(words) == cli.BAD_INPUT
     assert "put the folder of its file on PYTHONPATH" in capsys.readouterr().err
+
+
+def test_the_list_of_commands_has_a_line_for_each():
+    assert [name for name, module in cli.modules().items() if cli._first_line(module) == "not installed"] == []

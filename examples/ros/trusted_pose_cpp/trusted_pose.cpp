@@ -15,7 +15,8 @@ struct TrustedPose : rclcpp::Node
   void on_detection(const Detection3DArray & message)
   {
     const double age = (now() - rclcpp::Time(message.header.stamp, get_clock()->get_clock_type())).seconds();
-    const auto * best = message.detections.empty() ? nullptr : &message.detections[0].results.at(0);
+    const bool is_empty = message.detections.empty() || message.detections[0].results.empty();
+    const auto * best = is_empty ? nullptr : &message.detections[0].results[0];
     if (!best || !(best->hypothesis.score >= least) || (0.0 < oldest && oldest < age)) {
       const char * bone = best ? best->hypothesis.class_id.c_str() : "no pose";
       RCLCPP_WARN(get_logger(), "hold: %s, %.2f, %.1f s old", bone, best ? best->hypothesis.score : 0.0, age);

@@ -12,7 +12,7 @@ SPIKE = 5.0  # edges between a vertex and the middle of its neighbours: 4.2 at m
 
 
 def doubt_of(mesh: Surface) -> str:
-    """Say in words what looks damaged; empty for a sound mesh, also one with plain holes."""
+    """Say in words what looks damaged; empty for most sound meshes, also with holes."""
     said = []
     if 0 < (count := _odd_faces(mesh)) <= MOST_ODD:
         said.append(f"{count} of {len(mesh.triangles)} faces do not fit those around them")

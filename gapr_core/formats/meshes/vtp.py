@@ -75,7 +75,7 @@ class _File:
         said = piece.get(f"NumberOf{name}")
         if said is None and piece.find(f"{name}/DataArray") is not None:
             raise ValueError(f"no NumberOf{name} in it")
-        count = int(said or "0")
+        count = 0 if said is None else int(said)
         if count == 0:
             return np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
         arrays = {array.get("Name"): array for array in piece.findall(f"{name}/DataArray")}

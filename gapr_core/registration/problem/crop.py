@@ -22,7 +22,8 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
     Args:
         points: (N, 3), mm, in their own frame.
         T_box_points: (4, 4) pose of that frame in the box's frame, mm.
-        lowest, highest: (3,) opposite corners of the box, mm, box frame; included.
+        lowest: (3,) corner of the box, mm, box frame; included.
+        highest: (3,) the opposite corner.
 
     Raises:
         ConfigError: a corner is not (3,) numbers, or `lowest` is not below `highest`.

@@ -147,11 +147,13 @@ def odd_size(bone: Surface) -> ResultWarning | None:
 
     A bone and a source in the same wrong unit fit each other: only the size can show it.
     """
+    if not bone.unit:
+        return None
     low, high = WHOLE_BONE_MM
     extent_mm = bone.extent_mm
-    others = _across_mm(extent_mm / MM_PER_UNIT.get(bone.unit, 1.0), WHOLE_BONE_MM)
+    others = _across_mm(extent_mm / MM_PER_UNIT[bone.unit], WHOLE_BONE_MM)
     sizes = ", ".join(f"{size:.0f} mm in {NAMES[unit]}" for unit, size in others.items() if unit != bone.unit)
-    if not bone.unit or (low <= extent_mm <= high and not (bone.unit == "cm" and "in" in others)):
+    if low <= extent_mm <= high and not (bone.unit == "cm" and "in" in others):
         return None
     what = "longer than any human bone" if extent_mm > high else "as small as a patella" if extent_mm < low else ""
     text = f"The bone is {extent_mm:.3g} mm across, read in {NAMES[bone.unit]}{', ' * bool(what)}{what}."

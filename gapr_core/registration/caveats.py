@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,14 @@ Array = NDArray[np.float64]
 Source = str | Path | ArrayLike | Surface
 
 
+class Register(Protocol):
+    """`register` as its users see it."""
+
+    def __call__(
+        self, source: Source, target: PreparedTarget, initial: ArrayLike | None = None, viewpoint: Any = None
+    ) -> RegistrationResult: ...
+
+
 LOOSE_DEG = 5.0  # a turn that may be larger than what counts as right
 WITHIN_95 = float(norm.ppf(0.975))
 SENSOR_UNKNOWN = ResultWarning(
@@ -38,7 +46,7 @@ TRACKING_UNKNOWN = ResultWarning(
 )
 
 
-def answering(register: Callable[..., RegistrationResult]) -> Callable[..., RegistrationResult]:
+def answering(register: Callable[..., RegistrationResult]) -> Register:
     """Let a `register` take a path, an array or a `Surface`, and complete its result with what a reader needs."""
 
     @wraps(register)
@@ -50,7 +58,7 @@ def answering(register: Callable[..., RegistrationResult]) -> Callable[..., Regi
         result = replace(result, warnings=_warnings(result, target, self.config))
         return completed(result, target.surface, clouds.finite_points(points))
 
-    return call
+    return call  # type: ignore[return-value]  # as a method it is bound
 
 
 def completed(result: RegistrationResult, bone: Surface, source: Array) -> RegistrationResult:

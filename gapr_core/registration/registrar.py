@@ -31,6 +31,7 @@ from gapr_core.registration.checks.assess import assess_fit, bias_corrected, fol
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.conclude import conclude, unit_question
 from gapr_core.registration.confidence.classifier import Classifier
+from gapr_core.registration.fit import alternatives
 from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
 from gapr_core.registration.fit.verification import Candidates, support, verify
 from gapr_core.registration.guidance import guide
@@ -179,6 +180,7 @@ class Registrar:
         accepted = assessment.reaches(self.config.min_confidence)
         mostly_clutter = None if accepted else scene_fit.mostly_clutter(assessment, self.config)
         result = conclude(assessment, self.config, mostly_clutter)
+        alternatives.trial_of.cache_clear()  # it holds the bone
         clock.lap("assess")
         return replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages)
 

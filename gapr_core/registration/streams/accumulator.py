@@ -97,7 +97,8 @@ class Accumulator(Collection):
         if not len(points):
             return
         self._unless_far(points)
-        if not any(is_repeated(fingerprint(each), fingerprint(points)) for each in self._kept + self._new):
+        new = fingerprint(points)
+        if not any(is_repeated(fingerprint(each), new) for each in self._kept + self._new):
             self._new = [*self._new, points][-self.most :]
 
     @answering

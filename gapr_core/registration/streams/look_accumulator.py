@@ -259,7 +259,7 @@ class LookAccumulator(Collection):
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
             self._looks, self._rows, self._refused_in_a_row = asked, {}, []
-            self._last = self._last if result.T_target_source is None else result.T_target_source
+            self._last = self._last if result.T_target_source is None else result.T_target_source.copy()
             return ""
         if verdict in ROW_OF:
             row = self._rows.setdefault(ROW_OF[verdict], [])

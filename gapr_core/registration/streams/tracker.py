@@ -190,7 +190,8 @@ class Tracker:
         if result.T_target_source is None:
             return
         followed = result.proposer == PreviousPoses.name
-        self._memory.place = result.inferred_viewpoint
+        place = result.inferred_viewpoint
+        self._memory.place = None if place is None else place.copy()
         self._since_full = self._since_full + 1 if followed else 0
         if followed:
             self._memory.follow(result.T_target_source, source)

@@ -122,6 +122,7 @@ UNSURE = ("another subject", "under tissue that grows")  # may be accepted, but 
 def test_no_sure_pose_comes_from_a_bone(registrar, femur, target, what):
     result = registrar.register(NOT_BELIEVED[what](femur), target)
     assert not result.ok or (what in UNSURE and result.confidence < 0.9), str(result)
+    assert result.ok or (result.T_target_source is result.covariance is None and result.reason)
 
 
 def test_a_flipped_scan_of_a_pelvis_with_one_larger_side_is_refused(registrar):

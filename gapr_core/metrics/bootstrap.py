@@ -53,8 +53,10 @@ def share_interval(hits: ArrayLike, groups: Sequence[str] | None = None) -> tupl
     if not len(hits) or np.isfinite(low):
         return low, high
     subjects = len(np.unique(_labels(hits, groups)))
-    found = stats.binomtest(round(float(hits.mean()) * subjects), subjects).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
+    share, z = float(hits.mean()), float(stats.norm.ppf(0.975))  # SciPy's own needs a count, and a share is none
+    middle = share + z**2 / (2.0 * subjects)
+    half = z * np.sqrt(share * (1.0 - share) / subjects + (z / (2.0 * subjects)) ** 2)
+    return tuple(np.clip((middle + np.array([-half, half])) / (1.0 + z**2 / subjects), 0.0, 1.0).tolist())
 
 
 def _labels(values: Array, groups: Sequence[str] | None) -> Array:

@@ -242,6 +242,7 @@ def test_a_command_that_is_stopped_while_it_loads_says_so_in_one_line(tmp_path, 
     (tmp_path / "cloud.xyz").write_text("0 0 0\n50 0 0\n0 80 0\n")
     script = f"""
 import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
 class Press:
     def find_spec(self, name, path, target=None):
         if name == {module!r}:

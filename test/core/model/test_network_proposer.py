@@ -8,7 +8,6 @@ import torch
 
 from gapr_core import Registrar
 from gapr_core.config import SourceConfig
-from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
@@ -30,9 +29,8 @@ def proposer(toy, **options):
     return NetworkProposer(GAPRNet(toy.small_config()), **options)
 
 
-@pytest.mark.parametrize("method", ["local_to_global", "ransac"])
-def test_proposals_are_rigid_poses_best_first(method, toy, pair):
-    found = proposer(toy, method=method).propose(*pair, np.random.default_rng(0))
+def test_proposals_are_rigid_poses_best_first(toy, pair):
+    found = proposer(toy).propose(*pair, np.random.default_rng(0))
     assert found.poses.shape == (len(found.scores), 4, 4) and len(found.scores) > 1
     assert (np.diff(found.scores) <= 0).all() and np.allclose(np.linalg.det(found.poses[:, :3, :3]), 1.0)
 
@@ -87,11 +85,6 @@ def test_of_other_weights_than_the_shipped_ones_it_is_said_that_no_confidence_wa
     assert not caplog.messages
     Registrar(proposers=[own])
     assert "fitted to the shipped weights, and this network has others" in caplog.text
-
-
-def test_an_unknown_method_is_refused(toy):
-    with pytest.raises(ConfigError):
-        proposer(toy, method="guess")
 
 
 def test_networks_of_the_same_weights_share_the_work_on_a_target_and_others_do_not(toy, pair, tmp_path):

@@ -192,9 +192,9 @@ def test_an_interval_of_many_values_needs_little_memory():
 @pytest.mark.parametrize(("hits", "people", "ends"), [
     ([1], None, (0.2065, 1.0)),  # 1 / (1 + 1.96^2)
     ([1, 1, 1, 1], "aaaa", (0.2065, 1.0)),  # one subject, however many pairs
-    ([1, 0, 1], "aaa", (0.2065, 1.0)),
+    ([1, 0, 1], "aaa", (0.0942, 0.9747)),  # (2 / 3 + 1.96^2 / 2 -+ 1.96 sqrt(2 / 9 + (1.96 / 2)^2)) / (1 + 1.96^2)
     ([0] * 20, None, (0.0, 0.1611)),  # 1.96^2 / (20 + 1.96^2)
-    ([1, 0] * 5, "aabbccddee", (0.1176, 0.7693)),  # subjects that agree: 2 of 5, rounded to even
+    ([1, 0] * 5, "aabbccddee", (0.1704, 0.8296)),  # subjects that agree: a half of 5
     ([0, 1], None, (0.0, 1.0)),  # means of 0, 1/2, 1/2 and 1, equally often
     ([], None, (np.nan, np.nan)),
 ])  # fmt: skip

@@ -91,6 +91,8 @@ class NodeParameters(Settings):
     track: bool = setting(True, "start at the last pose; false: every cloud by itself", live=False)
     guide: bool = setting(False, "compute where to look next, for ~/debug/next_view; takes time", live=False)
     device: str = setting("auto", "where the network runs", choices=("auto", "cpu", "cuda"), live=False)
+    weights: str = setting("", "file of a network of your own (gapr train); no confidence is fitted to it; empty: the "
+                           "shipped one", live=False)  # fmt: skip
     settings_file: str = setting("", "YAML file as for `gapr register --config`; must not contradict a parameter",
                                  live=False)  # fmt: skip
     autostart: bool = setting(True, "configure and activate at the start; false: a lifecycle manager does", live=False)

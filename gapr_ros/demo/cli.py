@@ -11,12 +11,13 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gapr_core.errors import GaprError
 from gapr_core.runtime import files
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import DemoError, camera_round, probe_sweep, write_bag
 
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "--scene and --guided: 12)")  # fmt: skip
     parser.add_argument("--period", type=_period, metavar="S",
                         help="time between two clouds of the bag (default: 1 s; --scene: 3 s)")  # fmt: skip
+    parser.add_argument("--weights", type=a_path, help="of a network of your own (gapr train), instead of the shipped")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag")
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder (default: demo_output)")
 
@@ -72,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if args.real is not None:
         from gapr_ros.demo import real
 
-        return real.run(args.real, console)
+        return real.run(args.real, console, args.weights)
     args.frames = FRAMES[args.act] if args.frames is None else args.frames
     try:
         files.check_writable(args.out / "report.html")
@@ -95,6 +97,7 @@ def _from_bag(args: argparse.Namespace, console: Any) -> int:
     say(f"Making a {args.bone} (subject {args.seed}) and {DOING[args.act]}")
     period_s = PERIOD_S[args.act] if args.period is None else args.period
     act = MAKERS[args.act](args.bone, args.seed, args.frames, period_s, args.out)
+    act = replace(act, parameters={**act.parameters, **_own(args)})
     say(f"Writing {args.frames} clouds to the bag {args.out / 'bag'}")
     write_bag(act, args.out / "bag", args.storage)
     with observing(args.out / "log") as observer:
@@ -111,6 +114,11 @@ def _from_bag(args: argparse.Namespace, console: Any) -> int:
     return 0 if demo_report.passed(rows) else 1
 
 
+def _own(args: argparse.Namespace) -> dict[str, Path]:
+    """Return the user's parameters of the node."""
+    return {"weights": args.weights.resolve()} if args.weights else {}
+
+
 def _guided(args: argparse.Namespace, console: Any) -> int:
     from gapr_ros.demo import guided
     from gapr_ros.demo import report as demo_report
@@ -121,7 +129,7 @@ def _guided(args: argparse.Namespace, console: Any) -> int:
     probe = guided.make_probe(args.bone, args.seed)
     with observing(args.out / "log") as observer:
         say(f"Starting register_node (ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}) with guide:=true")
-        looks = guided.follow(probe, observer, args.frames, args.out, console)
+        looks = guided.follow(probe, observer, args.frames, args.out, console, _own(args))
     rows = guided.judged(probe, looks)
     console.print(demo_report.rich_table(rows))
     say("Writing the report")

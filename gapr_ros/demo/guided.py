@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -66,14 +66,19 @@ def make_probe(bone: str, seed: int) -> LookingProbe:
     return LookingProbe(parametric_specimen(bone, seed), seed)
 
 
-def follow(probe: LookingProbe, observer: Observer, most: int, folder: Path, console: Any) -> list[Look]:
+def follow(
+    probe: LookingProbe, observer: Observer, most: int, folder: Path, console: Any, own: Mapping[str, Any] | None = None
+) -> list[Look]:
     """Look, ask the node, and look where the answer says, until the pose is good enough or advice ends.
+
+    `own` are the user's parameters of the node.
 
     Raises:
         DemoError: the node did not start, or ended too early.
     """
     path, looks = write_bone(probe.specimen, folder), []
-    with running(observer, folder, {"model_path": path.resolve(), "model_unit": "mm", **PARAMETERS}) as node:
+    parameters = {"model_path": path.resolve(), "model_unit": "mm", **PARAMETERS, **(own or {})}
+    with running(observer, folder, parameters) as node:
         sender = Sender(node, "tracker")
         with console.status(STARTING):
             node.wait_until_ready()

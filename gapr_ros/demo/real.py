@@ -15,9 +15,9 @@ from gapr_core.results import confidence_text
 COLUMNS = ("cloud", "points", "answer", "confidence", "TRE mm", "off mm", "off deg", "truth")
 
 
-def run(folder: Path, console: Any) -> int:
+def run(folder: Path, console: Any, weights: Path | None = None) -> int:
     """Print a line for each cloud; 1 when an accepted pose is wrong, or none was accepted."""
-    registrar, table, right, wrong = Registrar.from_pretrained(), Table(*COLUMNS), 0, 0
+    registrar, table, right, wrong = Registrar.from_pretrained(weights=weights), Table(*COLUMNS), 0, 0
     for pair in real.pairs(folder):
         console.print(f"registering {pair.name}", highlight=False)
         result = registrar.register(pair.source, registrar.prepare(pair.target))

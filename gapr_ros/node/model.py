@@ -178,6 +178,7 @@ class ShippedMethod:
 
         Raises:
             ConfigError: the file cannot be read, holds what no setting is, or what a parameter decides otherwise.
+            WeightsError: `weights` are missing, damaged or of another format.
         """
         from gapr_core import Accumulator, LookAccumulator, Registrar, Tracker
 
@@ -185,7 +186,8 @@ class ShippedMethod:
             settings = _read_settings(parameters.settings_file)
             check_file(settings, parameters, _named_in(parameters.settings_file))
             self._settings = settings
-        registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
+        weights = _expanded(parameters.weights) if parameters.weights else None
+        registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device, weights)
         method = Tracker(registrar) if parameters.track else registrar
         if not parameters.collects:
             return method

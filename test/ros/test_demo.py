@@ -123,6 +123,18 @@ def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkey
     assert "demo_femur.stl" in " ".join(lines)
 
 
+@pytest.mark.parametrize("act", [[], ["--guided"]])
+def test_the_demo_takes_weights_of_ones_own(tmp_path, monkeypatch, act):
+    monkeypatch.setenv("ROS_DOMAIN_ID", os.environ["ROS_DOMAIN_ID"])
+    parser = argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    lines = []
+    monkeypatch.setattr("rich.console.Console.print", lambda self, *text, **_: lines.extend(map(str, text)))
+    arguments = [*act, "--weights", str(tmp_path / "none.safetensors"), "--out", str(tmp_path), "--frames", "2"]
+    assert demo.run(parser.parse_args(arguments)) == 1
+    assert "none.safetensors" in " ".join(lines)
+
+
 def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):
     act = Act("femur", None, tmp_path, (CLOUD,), (TRUTH,), 0.1, "", "")
     for _ in range(2):

@@ -19,7 +19,10 @@ from std_srvs.srv import Trigger
 
 from gapr_core import Accumulator, LookAccumulator
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, WeightsError
+from gapr_core.model import weights
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
 from gapr_core.runtime.settings import changes
 from gapr_ros.node.model import ShippedMethod, check_file, configured, load_model
 from gapr_ros.parameters import NodeParameters
@@ -168,6 +171,16 @@ def test_the_tilde_of_a_settings_file_is_the_home_folder_which_a_shell_leaves_as
     assert method.config.refinement.rounds == 11
     with pytest.raises(ConfigError, match="min_confidence"):
         ShippedMethod()(replace(NodeParameters(), settings_file="~/settings.yaml", min_confidence=0.9))
+
+
+def test_the_node_takes_weights_of_ones_own_and_refuses_a_file_that_is_not_there(tmp_path, monkeypatch):
+    own = GAPRNet(ModelConfig(width=16, global_width=32, global_layers=1))
+    weights.save(own, tmp_path / "own.safetensors", {})
+    monkeypatch.setenv("HOME", str(tmp_path))
+    registrar = ShippedMethod()(replace(NodeParameters(), weights="~/own.safetensors", track=False))
+    assert registrar.proposers[0].network.config == own.config and not registrar.proposers[0].is_shipped
+    with pytest.raises(WeightsError, match="another"):
+        ShippedMethod()(replace(NodeParameters(), weights="~/another.safetensors"))
 
 
 def test_a_node_that_was_shut_down_says_to_start_it_again(blob_path, client, method):

@@ -47,6 +47,8 @@ def test_a_folder_without_data_and_a_record_without_its_bone_are_one_line(datase
     with pytest.raises(ConfigError, match="specimen folders"):
         list(real.pairs(empty))
     assert main(["demo", "--real", str(empty)]) == 1 and capsys.readouterr().err.count("\n") == 1
+    assert main(["demo", "--real", str(dataset), "--weights", str(empty / "none")]) == 1
+    assert "safetensors" in capsys.readouterr().err
     (dataset / "specimen01/CT_bone_segmentations/femur.stl").unlink()
     with pytest.raises(InvalidPointCloudError, match=r"femur\.stl"):
         list(real.pairs(dataset))

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from gapr_core import clouds
 from gapr_core.config import RegistrarConfig
@@ -33,7 +33,7 @@ class Register(Protocol):
 
 
 LOOSE_DEG = 5.0  # a turn that may be larger than what counts as right
-WITHIN_95 = float(norm.ppf(0.975))
+WITHIN_95 = float(ndtri(0.975))
 SENSOR_UNKNOWN = ResultWarning(
     "sensor_unknown",
     "The sensor is not named, so the error bound allows for any.",

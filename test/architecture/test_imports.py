@@ -49,6 +49,11 @@ def test_importing_the_core_loads_neither_torch_nor_open3d_nor_numba():
     assert loaded.isdisjoint({"torch", "open3d", "numba", "matplotlib", "jinja2", "vtkmodules", "rclpy"})
 
 
+def test_the_shipped_registrar_loads_no_library_of_statistics_or_pictures():
+    loaded = loaded_by("from gapr_core import Registrar; Registrar.from_pretrained()")
+    assert loaded.isdisjoint({"scipy.stats", "open3d", "matplotlib", "vtkmodules"})
+
+
 def test_the_command_line_answers_without_loading_torch_or_open3d():
     loaded = loaded_by("from gapr_core.cli import main")
     assert loaded.isdisjoint({"torch", "open3d", "numba", "rclpy"})

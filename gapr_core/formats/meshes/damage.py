@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.surface import Surface
 
@@ -23,21 +24,29 @@ def doubt_of(mesh: Surface) -> str:
 
 def _odd_faces(mesh: Surface) -> int:
     """Count faces of which two edges do not have exactly one neighbour; 0 where other faces are odd, too."""
-    edges = np.sort(np.stack([mesh.triangles, np.roll(mesh.triangles, -1, axis=1)], axis=-1), axis=-1)
-    keys = edges[..., 0] * len(mesh.points) + edges[..., 1]
-    _, number, count = np.unique(keys, return_inverse=True, return_counts=True)
-    faces = int(((count != 2)[number].reshape(-1, 3).sum(axis=1) >= 2).sum())
-    return faces if (count != 2).sum() <= EDGES * (faces + 1) else 0
+    from scipy.sparse import coo_array
+
+    first, second = mesh.triangles.ravel(), mesh.triangles[:, [1, 2, 0]].ravel()
+    ends = np.minimum(first, second), np.maximum(first, second)
+    shares = coo_array((np.ones(len(first), dtype=np.int32), ends), shape=2 * (len(mesh.points),)).tocsr()
+    odd = int((shares.data != 2).sum())
+    if not 0 < odd <= EDGES * (MOST_ODD + 1):
+        return 0
+    faces = int(((shares[ends] != 2).reshape(-1, 3).sum(axis=1) >= 2).sum())
+    return faces if odd <= EDGES * (faces + 1) else 0
 
 
 def _spikes(mesh: Surface) -> int:
     """Count vertices that are many edges, of the mesh and of those around it, from the middle of their neighbours."""
-    total, corners = len(mesh.points), mesh.points[mesh.triangles]
-    opposite = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=2).ravel()
-    middles = 0.5 * (np.roll(corners, -1, axis=1) + np.roll(corners, -2, axis=1)).reshape(-1, 3)
-    vertex = mesh.triangles.ravel()
+    total, vertex = len(mesh.points), mesh.triangles.ravel()
+    corners = [mesh.points.take(corner, axis=0) for corner in mesh.triangles.T]
+    opposite = np.stack([_length(corners[i - 1] - corners[i - 2]) for i in range(3)], axis=1).ravel()
     faces = np.maximum(np.bincount(vertex, minlength=total), 1)
-    middle = np.stack([np.bincount(vertex, weights, total) / faces for weights in middles.T], axis=1)
-    off = np.linalg.norm(mesh.points - middle, axis=1)
+    sums = [sum(np.bincount(corner, along, total) for corner in mesh.triangles.T) for along in sum(corners).T]
+    off = _length(1.5 * mesh.points - 0.5 * np.stack(sums, axis=1) / faces[:, None])  # a vertex counts in its faces
     around = np.bincount(vertex, opposite, total) / faces
     return int(((faces > 2) & (off > SPIKE * around) & (off > SPIKE * np.median(opposite))).sum())
+
+
+def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))

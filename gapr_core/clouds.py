@@ -103,6 +103,8 @@ def _checked(surface: Surface) -> Surface:
 def finite_points(array: ArrayLike) -> Array:
     """Keep the finite rows of an (N, 3) array below 1e12; the result may be empty."""
     points = as_points(array)
+    if len(points) and max(points.max(), -points.min()) < BEYOND:  # of NaN it is not
+        return points
     return points[is_point(points)]
 
 

@@ -41,7 +41,7 @@ class SourceConfig(Settings):
     )
     normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
     smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
-    most_raw_points: int = setting(100_000, "larger clouds are first thinned to this number at random", low=1000)
+    most_raw_points: int = setting(30_000, "larger clouds are first thinned to this number at random", low=1000)
     dense_points: int = setting(400, "least points of a cloud for the removal of isolated points", low=20)
     companions: int = setting(6, "a point with fewer near points is isolated", low=1, high=1000)
     isolated_mm: float = setting(12.0, "points at this distance or less are near", low=0, high=1000, unit="mm")

@@ -25,7 +25,7 @@ from msg_adapters import InvalidMessageError, cloud_to_grid, cloud_to_xyz
 Array = NDArray[np.float64]
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 MOST_OF_ANY_MM = 1e8
-MOST_POINTS = 200_000  # larger clouds are thinned, always alike
+MOST_POINTS = 60_000  # larger clouds are thinned, always alike
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 # A table: a plane that is larger than the bone
 TABLE_SHARE, TABLE_SIZE = 0.3, 1.2  # least share of the points, and of the bone's extent

@@ -145,7 +145,7 @@ def test_five_million_points_are_thinned_and_answered(live):
     node, client, method = live
     values = client.ask(cloud)
     assert values["level"] == 0, values
-    assert (values["points_in"], values["points_used"]) == ("5000000", "200000")
+    assert (values["points_in"], values["points_used"]) == ("5000000", "60000")
 
 
 def test_an_old_cloud_is_stale(live):

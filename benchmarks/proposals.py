@@ -3,7 +3,8 @@
     python benchmarks/proposals.py --pairs DIR [--limit N] [--out proposals.json]
 
 DIR is what `gapr make-pairs` writes. For each protocol: recall of the network's first pose as it is and refined, how
-far down the list the first hypothesis near the truth stands, and the time until it is there and until it is refined.
+far down the list the first hypothesis near the truth stands, the time until it is there and until it is refined, and
+the share of whole registrations that ask for the search.
 """
 
 from __future__ import annotations
@@ -15,11 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
-from gapr_core.benchmark.ransac import ransac
 from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.geometry import se3
@@ -30,8 +29,6 @@ from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposer
-from gapr_core.registration.proposals.consensus import Correspondences
-from gapr_core.registration.proposals.network import NetworkProposer
 from gapr_core.runtime.console import say
 
 CONFIG = RegistrarConfig(num_threads=1)
@@ -53,18 +50,12 @@ def main() -> int:
     methods = {
         "network": registrar.proposers[0],
         "search": registrar.proposers[1],
-        "ransac": NetworkProposer.from_weights(consensus=by_ransac),
     }
     rows = [measure(pair, registrar, methods) for pair in tqdm(chosen(args.pairs, args.limit), unit="pair")]
     if args.out:
         args.out.write_text(json.dumps(rows, indent=1) + "\n")
     say(table(rows))
     return 0
-
-
-def by_ransac(found: Correspondences, radius_mm: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses and scores as the paper finds them."""
-    return ransac(found, radius_mm, np.random.default_rng(0), count=count)
 
 
 def chosen(folder: Path, limit: int | None) -> list[Pair]:
@@ -79,10 +70,10 @@ def chosen(folder: Path, limit: int | None) -> list[Pair]:
 def measure(pair: Pair, registrar: Registrar, methods: dict[str, Proposer]) -> Row:
     """One pair: every proposer's list judged."""
     target = registrar.prepare(pair.target)
-    methods["ransac"].prepare(target)
     source = sources.prepare(pair.source)
     assert isinstance(source, PreparedSource)
     row: Row = {"pair": pair.name, "protocol": pair.protocol, "bone": pair.bone}
+    row["searched"] = int(getattr(registrar.assess(pair.source, target), "rounds", 0) > 1)
     for name, proposer in methods.items():
         row |= {f"{name}_{key}": value for key, value in one_list(proposer, source, target, pair).items()}
     return row
@@ -142,11 +133,11 @@ def table(rows: list[Row]) -> str:
         "pairs",
         "network's first pose: RR paper raw %",
         "refined %",
-        "RANSAC raw %",
         "4 mm/5 deg",
         "near pose among its 32 %",
         "network alone 4 mm/5 deg %",
         "search alone %",
+        "ask for the search %",
         "rank of the first near pose",
         "network s to propose (to a refined pose)",
         "search s",
@@ -161,8 +152,8 @@ def table(rows: list[Row]) -> str:
 
 def line(protocol: str, rows: list[Row]) -> str:
     """One protocol: shares in per cent, medians of ranks and times."""
-    shown = ("network_raw_paper", "network_refined_paper", "ransac_raw_paper", "network_raw")
-    shares = (*shown, "network_right", "search_right")
+    shown = ("network_raw_paper", "network_refined_paper", "network_raw")
+    shares = (*shown, "network_right", "search_right", "searched")
     share = {key: 100.0 * float(np.mean([r[key] for r in rows])) for key in shares}
     among = 100.0 * float(np.mean([r["network_near"] is not None for r in rows]))
     ranks = [float(np.median([r[f"{m}_near"] or np.inf for r in rows])) for m in ("network", "search")]
@@ -178,6 +169,7 @@ def line(protocol: str, rows: list[Row]) -> str:
         f"{among:.1f}",
         f"{share['network_right']:.1f}",
         f"{share['search_right']:.1f}",
+        f"{share['searched']:.0f}",
         f"{ranks[0]:.0f}; search {ranks[1]:.0f}",
         f"{t['network_propose_s']:.3f} ({t['network_total_s']:.3f})",
         f"{t['search_propose_s']:.3f} ({t['search_total_s']:.3f})",

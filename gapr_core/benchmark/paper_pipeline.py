@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gapr_core.model.pyramid import Frame
 
 Array = NDArray[np.float64]
+PAPER = SHIPPED.with_name("gapr_net_paper.safetensors")
 AGREES = 1.5  # matching radii within which a correspondence agrees with a pose
 
 
@@ -25,17 +26,17 @@ class PaperPipeline(Baseline):
     """Section IV of the paper from end to end, with the weights of a run.
 
     Args:
-        weights: safetensors file; the shipped network without one (which was not trained in the paper's regime).
+        weights: safetensors file; without one those of the paper's regime that ship.
 
     Raises:
         WeightsError: the file is missing, damaged or of another format.
     """
 
-    def __init__(self, weights: str | Path = SHIPPED) -> None:
+    def __init__(self, weights: str | Path = PAPER) -> None:
         from gapr_core.model import weights as files
 
         self.network = files.load(weights)[0]
-        self.name = "gapr_paper" if Path(weights) == SHIPPED else f"gapr_paper@{weights}"
+        self.name = "gapr_paper" if Path(weights) == PAPER else f"gapr_paper@{weights}"
 
     def _prepare(self, points: Array, normals: Array | None) -> Any:
         import torch

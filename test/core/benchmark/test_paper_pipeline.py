@@ -72,7 +72,7 @@ def test_table_one_is_one_command(tiny, tmp_path):
 
 
 def test_without_weights_or_budget_the_command_says_what_is_missing(tmp_path, capsys):
-    for arguments, wanted in ((["--table", "2"], "--weights"), (["--table", "5"], "--pairs")):
+    for arguments, wanted in ((["--table", "2", "--weights", "none"], "--weights"), (["--table", "5"], "--pairs")):
         assert cli.main(["paper", *arguments, "--out", str(tmp_path / "x")]) == cli.BAD_INPUT
         assert wanted in capsys.readouterr().err
 

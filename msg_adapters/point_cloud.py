@@ -56,9 +56,11 @@ def cloud_to_xyz(
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32: becomes infinite
         for column, name in enumerate("xyz"):
             xyz[:, column].reshape(records.shape)[...] = records[name]
-    keep = np.ones(len(xyz), dtype=bool) if keep_nan else np.isfinite(xyz).all(axis=1)
+    keep = np.ones(len(xyz), dtype=bool)
+    if not keep_nan:  # column by column: NumPy takes far longer along an axis of three
+        keep &= np.logical_and.reduce([np.isfinite(column) for column in xyz.T])
     if drop_zeros:
-        keep &= xyz.any(axis=1)
+        keep &= np.logical_or.reduce([column != 0 for column in xyz.T])
     return xyz if keep.all() else xyz[keep]
 
 

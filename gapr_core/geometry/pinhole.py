@@ -89,7 +89,9 @@ def is_centre_of(points: ArrayLike) -> bool:
 
 def _saw_something(points: Array) -> NDArray[np.bool_]:
     """(...) which of the points (..., 3) are points."""
-    return np.asarray((np.abs(points) < BEYOND).all(axis=-1) & points.any(axis=-1))
+    x, y, z = np.moveaxis(points, -1, 0)  # NumPy takes far longer along an axis of three
+    is_point = (np.abs(x) < BEYOND) & (np.abs(y) < BEYOND) & (np.abs(z) < BEYOND)
+    return np.asarray(is_point & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
 
 
 def _is_view_along(axis: int, points: Array) -> bool:

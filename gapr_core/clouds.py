@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
-from gapr_core.geometry.extent import BEYOND
+from gapr_core.geometry.extent import is_point
 from gapr_core.results import ResultWarning
 from gapr_core.surface import Array, Surface, as_array, as_points, check_faces
 
@@ -103,14 +103,8 @@ def _checked(surface: Surface) -> Surface:
 def finite_points(array: ArrayLike) -> Array:
     """Keep the finite rows of an (N, 3) array below 1e12; the result may be empty."""
     points = as_points(array)
-    if len(points) and max(points.max(), -points.min()) < BEYOND:  # of NaN it is not
-        return points
-    return points[is_point(points)]
-
-
-def is_point(rows: Array) -> NDArray[np.bool_]:
-    """(N,) which rows of an (N, 3) array can be points: finite, and none beyond 1e12."""
-    return np.asarray((np.abs(rows) < BEYOND).all(axis=1))
+    usable = is_point(points)
+    return points if usable.all() else points[usable]
 
 
 def check_extent(extent_mm: float, unit: str, name: str, how: str = CONVERT) -> None:

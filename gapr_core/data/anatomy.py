@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import check_extent, is_point, load
+from gapr_core.clouds import check_extent, load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import ending_of
+from gapr_core.geometry.extent import is_point
 from gapr_core.runtime import files
 from gapr_core.surface import Surface, check_faces
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.geometry.extent import BEYOND
+from gapr_core.geometry.extent import is_point
 
 Array = NDArray[np.float64]
 
@@ -89,9 +89,8 @@ def is_centre_of(points: ArrayLike) -> bool:
 
 def _saw_something(points: Array) -> NDArray[np.bool_]:
     """(...) which of the points (..., 3) are points."""
-    x, y, z = np.moveaxis(points, -1, 0)  # NumPy takes far longer along an axis of three
-    is_point = (np.abs(x) < BEYOND) & (np.abs(y) < BEYOND) & (np.abs(z) < BEYOND)
-    return np.asarray(is_point & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.asarray(is_point(points) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
 
 
 def _is_view_along(axis: int, points: Array) -> bool:

@@ -112,27 +112,21 @@ def test_ctrl_c_that_a_library_swallows_is_raised_again():
         interrupt.check()
 
 
-def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkeypatch):
-    monkeypatch.setattr("gapr_ros.demo.act.write_stl", lambda surface, path: path.write_text("this is no mesh"))
+@pytest.mark.parametrize(
+    ("act", "named"), [([], "demo_femur.stl"), ([], "none.safetensors"), (["--guided"], "none.safetensors")]
+)
+def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkeypatch, act, named):
+    if named == "demo_femur.stl":
+        monkeypatch.setattr("gapr_ros.demo.act.write_stl", lambda surface, path: path.write_text("this is no mesh"))
+    else:
+        act = [*act, "--weights", str(tmp_path / named)]
     monkeypatch.setenv("ROS_DOMAIN_ID", os.environ["ROS_DOMAIN_ID"])
     parser = argparse.ArgumentParser()
     demo.add_arguments(parser)
     lines = []
     monkeypatch.setattr("rich.console.Console.print", lambda self, *text, **_: lines.extend(map(str, text)))
-    assert demo.run(parser.parse_args(["--out", str(tmp_path), "--frames", "2"])) == 1
-    assert "demo_femur.stl" in " ".join(lines)
-
-
-@pytest.mark.parametrize("act", [[], ["--guided"]])
-def test_the_demo_takes_weights_of_ones_own(tmp_path, monkeypatch, act):
-    monkeypatch.setenv("ROS_DOMAIN_ID", os.environ["ROS_DOMAIN_ID"])
-    parser = argparse.ArgumentParser()
-    demo.add_arguments(parser)
-    lines = []
-    monkeypatch.setattr("rich.console.Console.print", lambda self, *text, **_: lines.extend(map(str, text)))
-    arguments = [*act, "--weights", str(tmp_path / "none.safetensors"), "--out", str(tmp_path), "--frames", "2"]
-    assert demo.run(parser.parse_args(arguments)) == 1
-    assert "none.safetensors" in " ".join(lines)
+    assert demo.run(parser.parse_args([*act, "--out", str(tmp_path), "--frames", "2"])) == 1
+    assert named in " ".join(lines)
 
 
 def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):

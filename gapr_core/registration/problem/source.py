@@ -126,7 +126,7 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
     Not evenly spread: some stay so near to each other that shared errors of near residuals show (`roughness`).
     """
     is_clean = len(points) <= config.most_points and not _has_outliers(points)
-    whole = points if is_clean else without_isolated(points, config, num_threads)
+    whole = points if is_clean else without_isolated(points, config)
     if len(whole) > config.most_points:
         whole = whole[sampling.thin(whole, config.most_points)]
     some = whole[_drawn(whole, config.fitted_points)]
@@ -166,7 +166,7 @@ def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
     return None
 
 
-def without_isolated(points: Array, config: SourceConfig, num_threads: int = 1) -> Array:
+def without_isolated(points: Array, config: SourceConfig) -> Array:
     """Remove points that are far from all others (N, 3), mm: far echoes, flying pixels.
 
     Open3D's `remove_radius_outlier` with a radius that follows the spacing. A sparse cloud stays as it is.
@@ -174,8 +174,7 @@ def without_isolated(points: Array, config: SourceConfig, num_threads: int = 1) 
     if len(points) < config.dense_points:
         return points
     some = points[:: -(-len(points) // config.most_compared)]
-    gaps = quadrics.nearest(points, config.companions + 1, cKDTree(some), num_threads)[0]
-    return points[_has_companions(gaps[:, -1], config)]
+    return points[_has_companions(cKDTree(some).query(points, k=config.companions + 1)[0][:, -1], config)]
 
 
 def _has_outliers(points: Array) -> bool:
@@ -193,9 +192,9 @@ def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[A
     """Remove isolated points and keep the neighbours of the others where one look-up gives both, else None."""
     count = _around_count(len(points), config)
     if not config.dense_points <= len(points) <= min(config.most_points, config.most_compared):
-        return without_isolated(points, config, num_threads), None
+        return without_isolated(points, config), None
     if config.companions >= count:
-        return without_isolated(points, config, num_threads), None
+        return without_isolated(points, config), None
     gaps, around = quadrics.nearest(points, count, num_threads=num_threads)
     stays = _has_companions(gaps[:, config.companions], config)
     if stays.all():

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core.clouds import finite_points, is_point
+from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry.extent import is_point
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource

@@ -23,11 +23,7 @@ SAME_MM = 1e-4  # rounding to single precision; the noise of a new measurement m
 
 def fingerprint(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute (7,) number, mean and standard deviations, mm, of points (N, 3): their order does not matter."""
-    if not len(points):
-        return np.zeros(7)
-    mean = points.mean(axis=0)
-    away = points - mean
-    return np.hstack([len(points), mean, np.sqrt(np.einsum("ni,ni->i", away, away) / len(points))])
+    return np.hstack([len(points), points.mean(axis=0), points.std(axis=0)]) if len(points) else np.zeros(7)
 
 
 def is_repeated(cloud: NDArray[np.float64], before: NDArray[np.float64]) -> bool:

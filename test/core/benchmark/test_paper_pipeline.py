@@ -71,6 +71,15 @@ def test_table_one_is_one_command(tiny, tmp_path):
     assert manifest["recipe"]["split"] == "test" and manifest["recipe"]["protocols"] == ["paper"]
 
 
+def test_tables_one_to_three_use_the_weights_that_ship_or_those_named(tiny, tmp_path, monkeypatch):
+    used = []
+    monkeypatch.setattr(paper, "benchmark", lambda pairs, methods, out, jobs, ours: used.append((methods[0], ours)))
+    for number, named in enumerate(([], ["--weights", str(tiny)])):
+        arguments = ["paper", "--table", "3", "--bones", "femur", "--count", "1", *named]
+        assert cli.main([*arguments, "--out", str(tmp_path / str(number))]) == cli.OK
+    assert used == [("gapr_paper", "gapr_paper"), (f"gapr_paper@{tiny}", f"gapr_paper@{tiny}")]
+
+
 def test_without_weights_or_budget_the_command_says_what_is_missing(tmp_path, capsys):
     for arguments, wanted in ((["--table", "2", "--weights", "none"], "--weights"), (["--table", "5"], "--pairs")):
         assert cli.main(["paper", *arguments, "--out", str(tmp_path / "x")]) == cli.BAD_INPUT

@@ -143,7 +143,7 @@ def test_a_nifti_header_of_an_image_in_another_file_is_refused(tmp_path):
 
 
 def test_a_dicom_segmentation_has_the_frames_and_bytes_of_its_header(tmp_path):
-    pydicom = pytest.importorskip("pydicom")
+    pydicom = pytest.importorskip("pydicom", reason="it writes the DICOM image: pip install pydicom")
     path = dicom_seg(tmp_path)
     for name, change in (("frames", {"NumberOfFrames": 3}), ("bytes", {"PixelData": b"\0\0"})):
         seg = pydicom.dcmread(path)

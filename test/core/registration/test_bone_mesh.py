@@ -34,7 +34,7 @@ def test_a_point_is_as_far_as_the_mesh_is_on_the_right_side(turned):
 
 
 def test_distances_are_those_of_open3d(femur):
-    o3d = pytest.importorskip("open3d")
+    o3d = pytest.importorskip("open3d", reason="reference: pip install open3d")
     target, rng = targets.prepare(femur), np.random.default_rng(0)
     on, normals = femur.sample(2000, rng)
     points = on + normals * rng.normal(0.0, 1.5, (2000, 1))

@@ -37,8 +37,9 @@ def test_what_is_not_named_keeps_its_default_and_lists_become_tuples():
     *[("at least|to", values) for values in (
         {"min_confidence": 7.0}, {"min_confidence": -0.1}, {"min_confidence": float("nan")}, {"num_threads": -1},
         {"refinement": {"iterations": 0}}, {"clutter": {"radii_mm": [30.0, -1.0]}}, {"max_tre_mm": -1.0},
-        {"other_bone_prior": 1.5},
+        {"other_bone_prior": 1.5}, {"sensor": {"noise_mm": -1.0}}, {"sensor": {"bias_mm": float("nan")}},
     )],
+    ("one of unknown, pointer", {"sensor": {"kind": "sonar"}}),
     ("at least one of radii_mm", {"clutter": {"radii_mm": [], "seeds": []}}),
     ("as many seeds as radii_mm", {"clutter": {"radii_mm": [30.0]}}),
     ("smallest_sigma_mm that is not above", {"refinement": {"smallest_sigma_mm": 5.0, "largest_sigma_mm": 3.0}}),

@@ -15,15 +15,6 @@ def sphere(count=4000, radius=30.0):
     return directions * radius, directions
 
 
-def test_thinning_keeps_at_most_the_number_asked_for_and_spreads_them():
-    points = np.random.default_rng(0).uniform(0, 100, (20_000, 3))
-    kept = points[sampling.thin(points, 1000)]
-    assert 900 <= len(kept) <= 1000
-    gaps = cKDTree(kept).query(kept, k=2)[0][:, 1]
-    random = points[np.random.default_rng(1).choice(20_000, 1000, replace=False)]
-    assert np.quantile(gaps, 0.05) > 1.5 * np.quantile(cKDTree(random).query(random, k=2)[0][:, 1], 0.05)
-
-
 def central_points(points, voxel_mm):
     """What `voxel_indices` finds, with NumPy."""
     cells = np.floor((points - points.min(axis=0)) / voxel_mm).astype(np.int64)
@@ -258,16 +249,6 @@ def test_the_variance_of_a_surface_element_is_its_gain_times_the_mean_square_mis
     misfit = quadrics.misfit_mm(target.points, target.normals, target.shapes, others)
     assert target.elements[:, 12] == pytest.approx(gain * misfit**2, abs=1e-12)
     assert misfit.max() > 0.05
-
-
-def test_quadrics_find_normals_and_curvature_of_a_sphere():
-    points, outward = sphere(4000, 30.0)
-    neighbours = cKDTree(points).query(points, k=16)[1]
-    noisy = quadrics.orient(quadrics.local_frames(points, neighbours).normals, outward)
-    normals, shapes = quadrics.fit_quadrics(points, noisy, neighbours)
-    assert np.einsum("ni,ni->n", normals, outward).min() > 0.9999
-    assert np.trace(shapes, axis1=1, axis2=2) == pytest.approx(-2.0 / 30.0, rel=0.05)  # it falls away: convex
-    assert np.abs(np.einsum("nij,nj->ni", shapes, normals)).max() < 1e-9
 
 
 def test_local_frames_are_right_handed_rotations():

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import covariance_about, error_twist, motion_jacobians, nees, predicted_rmse_mm
+from gapr_core.geometry.twists import covariance_about, error_twist, motion_jacobians, nees
 from gapr_core.metrics import bootstrap, cramer_rao
 from gapr_core.metrics.bootstrap import interval, share_interval
 
@@ -54,63 +54,12 @@ def test_motion_jacobians_are_the_derivative_of_the_motion():
     assert np.allclose(motion_jacobians(points, centre), np.stack(numeric, axis=2), atol=1e-4)
 
 
-def test_predicted_rmse_is_what_random_errors_of_that_covariance_give():
-    rng = np.random.default_rng(3)
-    points, covariance = rng.normal(size=(40, 3)) * 60, random_covariance(rng) * 0.01
-    centre = points.mean(axis=0)
-    twists = rng.multivariate_normal(np.zeros(6), covariance, size=3000)
-    shifts = np.array([se3.apply(se3.exp(t, centre), points) - points for t in twists])
-    assert predicted_rmse_mm(covariance, points, centre) == pytest.approx(
-        np.sqrt((shifts**2).sum(axis=2).mean()), rel=0.05
-    )
-
-
-def test_the_bound_is_what_least_squares_on_a_known_surface_reaches():
-    """Maximum likelihood on an ellipsoid (exact distances by linearisation) attains the bound at small noise."""
-    rng = np.random.default_rng(4)
-    sigma, clean_normals = 0.3, None
-    clean, clean_normals = ellipsoid(rng, 300)
-    true = random_pose(rng)
-    centre = clean.mean(axis=0)
-    rows = np.hstack([clean_normals, np.cross(clean - centre, clean_normals)])
-    twists = []
-    for _ in range(600):
-        noisy = clean + rng.normal(0, sigma, clean.shape)
-        twists.append(np.linalg.lstsq(rows, ((clean - noisy) * clean_normals).sum(axis=1), rcond=None)[0])
-    source = se3.apply(np.linalg.inv(true), clean)
-    bound = cramer_rao.pose_bound(source, clean, true, sigma, normals=clean_normals)
-    measured = np.cov(np.array(twists).T)
-    assert np.allclose(np.diag(measured) / np.diag(bound.covariance), 1.0, atol=0.25)
-    shifts = np.einsum("nij,kj->kni", motion_jacobians(clean, centre), np.array(twists))
-    assert bound.rmse_mm == pytest.approx(np.sqrt((shifts**2).sum(axis=2).mean()), rel=0.06)
-
-
-def test_the_bound_falls_with_the_root_of_the_points_and_rises_with_the_noise():
-    rng = np.random.default_rng(5)
-    clean, normals = ellipsoid(rng, 4000)
-    few = cramer_rao.pose_bound(clean[:1000], clean, np.eye(4), 1.0, normals).rmse_mm
-    assert cramer_rao.pose_bound(clean, clean, np.eye(4), 1.0, normals).rmse_mm == pytest.approx(few / 2, rel=0.1)
-    assert cramer_rao.pose_bound(clean[:1000], clean, np.eye(4), 2.0, normals).rmse_mm == pytest.approx(2 * few)
-
-
 def test_estimated_normals_give_nearly_the_bound_of_exact_ones():
     rng = np.random.default_rng(6)
     clean, normals = ellipsoid(rng, 6000)
     source = clean[:800] + rng.normal(0, 0.5, (800, 3))
     exact = cramer_rao.pose_bound(source, clean, np.eye(4), 0.5, normals)
     assert cramer_rao.pose_bound(source, clean, np.eye(4), 0.5).rmse_mm == pytest.approx(exact.rmse_mm, rel=0.1)
-
-
-def test_outliers_carry_no_information():
-    rng = np.random.default_rng(7)
-    clean, normals = ellipsoid(rng, 3000)
-    off = clean.copy()
-    off[:1500] += 10.0 * normals[:1500]
-    half = cramer_rao.pose_bound(clean[1500:], clean, np.eye(4), 0.5, normals)
-    with_outliers = cramer_rao.pose_bound(off, clean, np.eye(4), 0.5, normals)
-    assert np.linalg.det(with_outliers.covariance) ** (1 / 6) == pytest.approx(
-        np.linalg.det(half.covariance) ** (1 / 6), rel=0.1
-    )
 
 
 def test_the_bound_is_the_inverse_of_the_information_of_the_points_near_the_surface():
@@ -121,7 +70,8 @@ def test_the_bound_is_the_inverse_of_the_information_of_the_points_near_the_surf
     moved = clean + np.where(np.arange(60) < 10, 9.0, 0.0)[:, None] * normals
     centre = moved.mean(axis=0)
     J = np.hstack([normals, np.cross(moved - centre, normals)])[10:]
-    bound = cramer_rao.pose_bound(moved, clean, np.eye(4), 0.7, normals)
+    true = random_pose(rng)
+    bound = cramer_rao.pose_bound(se3.apply(se3.inverse(true), moved), clean, true, 0.7, normals)
     np.testing.assert_allclose(bound.covariance, np.linalg.inv(J.T @ J / 0.49), rtol=1e-7, atol=1e-12)
     np.testing.assert_allclose(bound.centre, centre)
     moves = motion_jacobians(moved, centre)

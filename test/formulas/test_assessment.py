@@ -156,8 +156,9 @@ def test_a_source_follows_both_cortices_where_they_leave_nothing_but_its_noise(
 ):
     """Less than .82 of the residuals of the outer one, and 1.5 of the noise, which is .15 mm at least."""
     assert not follows_both_cortices(a, CONFIG), "a bone of one surface"
-    hollow = replace(a.target, both_cortices=a.target)
+    hollow = replace(a.target, both_cortices=replace(a.target))
     source = replace(a.source, flatness_mm=np.full(len(a.source.points), flatness_mm))
-    monkeypatch.setattr(assess, "evaluate", lambda *_: replace(a.fit, sigma_mm=both_mm))
+    left_mm = {id(hollow): own_mm, id(hollow.both_cortices): both_mm}
+    monkeypatch.setattr(assess, "evaluate", lambda *on: replace(a.fit, sigma_mm=left_mm[id(on[2])]))
     seen = replace(a, target=hollow, source=source, fit=replace(a.fit, sigma_mm=own_mm))
     assert follows_both_cortices(seen, CONFIG) is follows

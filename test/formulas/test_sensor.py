@@ -68,6 +68,14 @@ def test_without_a_standoff_the_target_stays_itself():
     assert sensor.offset_surface(egg, SensorConfig()) is egg
 
 
+def test_a_standoff_is_added_to_that_of_a_target_that_lies_farther_out_already():
+    egg = tiny.ellipsoid()
+    twice = sensor.offset_surface(sensor.offset_surface(egg, SensorConfig(standoff_mm=2.0)), SensorConfig("pointer"))
+    assert twice.offset_mm == 2.0 + sensor.KINDS["pointer"].offset_mm == 2.5
+    moved_mm = np.einsum("ni,ni->n", twice.elements[:, :3] - egg.elements[:, :3], egg.elements[:, 3:6])
+    np.testing.assert_allclose(moved_mm, twice.offset_mm)
+
+
 def test_the_inner_cortex_is_moved_as_well():
     hollow = replace(tiny.plane(), both_cortices=tiny.ellipsoid())
     moved = sensor.offset_surface(hollow, SensorConfig(standoff_mm=0.5)).both_cortices

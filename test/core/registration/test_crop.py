@@ -7,7 +7,7 @@ from gapr_core.config import SourceConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration.problem.crop import crop_box, crop_to_pose
-from gapr_core.registration.problem.source import prepare, without_isolated
+from gapr_core.registration.problem.source import without_isolated
 
 
 def test_a_box_is_read_in_its_own_frame():
@@ -77,10 +77,3 @@ def test_slices_of_ultrasound_stay_whole():
     line = np.stack([np.arange(0.0, 40.0, 0.5), np.zeros(80), np.zeros(80)], axis=1)
     slices = np.vstack([line + [0.0, 30.0 * i, 0.0] for i in range(8)])
     assert len(without_isolated(slices, SourceConfig())) == len(slices)
-
-
-def test_a_source_is_prepared_without_its_isolated_points(femur):
-    points = femur.sample(1000, np.random.default_rng(1))[0]
-    far = points.mean(axis=0) + [[0.0, 400.0, 0.0]]
-    prepared = prepare(np.vstack([points, far]))
-    assert np.abs(prepared.points - far).sum(axis=1).min() > 100.0

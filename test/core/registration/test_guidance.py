@@ -92,16 +92,7 @@ def test_the_expected_bound_is_that_of_the_updated_covariance(distal):
 
 def test_a_rival_sends_the_probe_to_where_it_differs(distal):
     """A rival turned about the shaft leaves the shaft where it is and moves the head."""
-    turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 1.5], distal.fit.moved.mean(axis=0))
-    poses = np.stack([distal.candidates.poses[0], turn @ distal.fit.T])
-    scores = np.repeat(distal.candidates.scores[0], 2)
-    rival = replace(
-        distal,
-        candidates=replace(distal.candidates, poses=poses, scores=scores),
-        judgement=DOUBTFUL,
-        other_bone_prior=0.0,
-    )
-    found = guide(rival)
+    found = guide(rivalled(distal, 1.5))
     assert found.now_mm > 2.0 * distal.tre95_mm
     assert found.patches[0].rivals_excluded > 0.95
     assert min(patch.rivals_excluded for patch in found.patches) < 0.7

@@ -1,24 +1,15 @@
 """Who may import whom, and what an import costs."""
 
-import ast
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from imported import imported_roots
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gapr_core", "msg_adapters", "gapr_ros")
-
-
-def imported_roots(path):
-    """Top-level names of everything a file imports, inside functions too."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name.split(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
-            yield node.module.split(".")[0]
 
 
 def third_party(package):

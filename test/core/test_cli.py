@@ -51,13 +51,7 @@ def test_a_refusal_exits_with_2_and_has_no_transform(tmp_path, files, capsys):
     assert cli.main(["register", *files, "--json", str(tmp_path / "out.json")]) == 2
     answer = json.loads((tmp_path / "out.json").read_text())
     assert answer["transform"] is None and answer["status"] != "OK" and answer["reason"]
-
-
-def test_bad_input_exits_with_1_and_one_line(tmp_path, files, capsys):
-    (tmp_path / "text.ply").write_text("this is not a bone")
-    assert cli.main(["register", "--source", str(tmp_path / "text.ply"), *files[2:]]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1 and "text.ply" in captured.err
+    assert answer["tre_mm"] is None and answer["tre95_mm"] is None and answer["covariance"] is None
 
 
 def test_evaluate_answers_every_pair_without_the_truth(tmp_path, pair, capsys, caplog):
@@ -117,12 +111,6 @@ def test_two_runs_of_evaluate_lose_no_answers_of_each_other(tmp_path, pair):
     assert sorted(json.loads(out.read_text())) == [f"{name}{number}" for name in "ab" for number in range(6)]
 
 
-def test_an_answer_is_added_to_those_of_another_run(tmp_path):
-    (tmp_path / "poses.json").write_text('{"a": {"status": "OK"}}')
-    answers = evaluate._written(tmp_path / "poses.json", {"b": {"status": "ERROR"}})
-    assert set(answers) == {"a", "b"} and json.loads((tmp_path / "poses.json").read_text()) == answers
-
-
 def test_evaluate_spends_little_of_its_time_on_writing(tmp_path, monkeypatch):
     (tmp_path / "pairs").mkdir()
     for number in range(40):
@@ -165,18 +153,6 @@ def test_the_seconds_of_evaluate_are_without_the_first_call_and_without_preparin
     assert cli.main(["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "o.json")]) == 0
     answers = json.loads((tmp_path / "o.json").read_text())
     assert [(each["prepare_seconds"], each["seconds"]) for each in answers.values()] == [(2.0, 7.0)] * 2
-
-
-def test_wrong_usage_is_bad_input_not_a_refusal(capsys):
-    with pytest.raises(SystemExit) as exit:
-        cli.main(["register", "--source", "only.ply"])
-    assert exit.value.code == 1
-    assert "--target" in capsys.readouterr().err
-
-
-def test_a_folder_without_pairs_is_bad_input(tmp_path, capsys):
-    assert cli.main(["evaluate", "--pairs", str(tmp_path), "--out", str(tmp_path / "o.json")]) == 1
-    assert "NAME.npz" in capsys.readouterr().err
 
 
 def test_evaluate_answers_a_pair_again_that_is_another_one_now(tmp_path, pair):

@@ -430,7 +430,7 @@ def test_a_file_of_another_option_is_never_written_over(folder, capsys, line):
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("name", ["scene.mrml", "pose.tfm", "off_bone.vtk"])
+@pytest.mark.parametrize("name", ["scene.mrml", "pose.tfm", "off_bone.vtk", "targets.mrk.json"])
 def test_files_of_others_in_the_folder_of_a_scene_are_never_written_over(folder, capsys, name):
     (folder / "mine").mkdir()
     (folder / "mine" / name).write_text("<MRML></MRML>")

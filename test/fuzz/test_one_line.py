@@ -85,42 +85,6 @@ def test_pivot_refuses_damaged_recordings_and_tools_that_are_not_in_them(tmp_pat
         assert name in says_one_line(capsys, ["pivot", str(path), "--tool", tool])
 
 
-def scaled(name):
-    """A file of the body in metres."""
-    points, faces = mesh_samples.body()
-    points = points / np.float32(1000.0)
-    writers = {
-        "cloud.npy": lambda: mesh_samples._npy(points),
-        "faces.npz": lambda: mesh_samples._npz(points=points, faces=faces),
-        "binary.stl": lambda: mesh_samples._stl(points, faces)["binary.stl"],
-        "binary.ply": lambda: mesh_samples._ply(points, faces)["binary.ply"],
-        "binary.pcd": lambda: mesh_samples._pcd(points)["binary.pcd"],
-        "text42.vtk": lambda: mesh_samples._vtk(points, faces)["text42.vtk"],
-        "ascii-none.vtp": lambda: mesh_samples._vtk(points, faces)["ascii-none.vtp"],
-        "mesh.obj": lambda: "".join([*("v {} {} {}\n".format(*p) for p in points),
-                                     *("f {} {} {}\n".format(*f) for f in faces + 1)]).encode(),
-        "cloud.xyz": lambda: "".join("{} {} {}\n".format(*p) for p in points).encode(),
-    }  # fmt: skip
-    return writers[name]()
-
-
-UNITS = ["cloud.npy", "faces.npz", "binary.stl", "binary.ply", "binary.pcd", "text42.vtk", "ascii-none.vtp", "mesh.obj"]
-
-
-@pytest.mark.parametrize("name", [*UNITS, "cloud.xyz"])
-def test_register_says_which_unit_a_file_looks_like(tmp_path, capsys, good, name):
-    path = tmp_path / name
-    path.write_bytes(scaled(name))
-    for named in (("--source", str(path), "--target", good), ("--target", str(path), "--source", good)):
-        assert "it looks like m: pass units='m'" in says_one_line(capsys, register(*named))
-
-
-def test_markups_in_a_unit_that_is_none_are_refused(tmp_path, capsys, good):
-    path = tmp_path / "a.mrk.json"
-    path.write_bytes(WHOLE["points.mrk.json"].replace(b'"mm"', b'"inch"'))
-    assert "inch" in says_one_line(capsys, register("--source", str(path), "--target", good))
-
-
 @pytest.mark.parametrize("how", DAMAGE)
 def test_commands_that_read_folders_name_the_damaged_file(tmp_path, capsys, how):
     (tmp_path / "bones").mkdir()

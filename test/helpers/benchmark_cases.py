@@ -4,6 +4,7 @@ import numpy as np
 
 from gapr_core.benchmark.judge import answer_of, judge, pair_facts
 from gapr_core.benchmark.record import Record
+from gapr_core.benchmark.table import TIMES
 from gapr_core.data.pair import Pair
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -111,6 +112,10 @@ def make_pair(seed, protocol="L1", bone="femur", count=260):
     name = f"{protocol}_{bone}_{seed:04d}"
     metadata = {"noise_mm": 0.3, "overlap": 0.1 + 0.05 * seed}
     return Pair(source, target, truth, name, bone, f"person {seed % 3}", protocol, metadata)
+
+
+def timeless(rows):
+    return [{key: value for key, value in row.items() if key not in TIMES} for row in rows]
 
 
 def ok(T, confidence=0.8, covariance=None):

@@ -13,6 +13,7 @@ import torch
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.training.targets import training_pair
 
 torch.set_num_threads(1)
 SMALL = dict(
@@ -61,10 +62,17 @@ def motion(seed: int) -> np.ndarray:
     return se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-80, 80, 3))
 
 
+def pair(config, seed: int = 3, share: float = 0.5):
+    """A view of the bone, moved, and the bone, as a network learns from them."""
+    frame = target_frame(bone(), config)
+    source = build_cloud(se3.apply(motion(seed), view(bone(700, 1), share)), frame, config)
+    return training_pair(source, build_cloud(bone(), frame, config), se3.inverse(motion(seed)), frame)
+
+
 @pytest.fixture(scope="session")
 def toy() -> SimpleNamespace:
     """The functions above."""
-    return SimpleNamespace(bone=bone, view=view, motion=motion, small_config=small_config)
+    return SimpleNamespace(bone=bone, view=view, motion=motion, small_config=small_config, pair=pair)
 
 
 @pytest.fixture(scope="session")

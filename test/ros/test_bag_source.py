@@ -188,13 +188,6 @@ def test_without_the_libraries_of_ros_it_says_what_to_install(bag, monkeypatch):
         read(bag, topic="/points")
 
 
-def test_a_topic_of_something_that_is_no_bag_is_refused(tmp_path, capsys):
-    np.save(tmp_path / "bone.npy", 1000.0 * PIECES[0])
-    named = ["--source", str(tmp_path / "bone.npy"), "--target", str(tmp_path / "bone.npy")]
-    assert main(["register", *named, "--topic", "/points"]) == 1
-    assert "a bag for --topic; got bone.npy" in capsys.readouterr().err
-
-
 def test_a_registration_from_a_bag_finds_the_bone(tmp_path):
     bone, rng = make_bone("femur", 1), np.random.default_rng(0)
     points, normals = bone.sample(9000, rng)

@@ -8,7 +8,6 @@ import pytest
 from harness import PATIENCE_S, Client, NodeProcess, context, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
 from rclpy.node import Node
-from std_srvs.srv import SetBool
 
 from gapr_core.geometry import se3
 from gapr_ros.bags.files import open_bag
@@ -16,16 +15,6 @@ from gapr_ros.bags.replay import Replay, ReplayOptions
 from gapr_ros.bags.writing import BagWriter
 from gapr_ros.node import units
 from msg_adapters import list_to_covariance, pose_to_matrix
-
-REFUSALS_OF_SHAPE = {
-    "too_few_points",
-    "ambiguous",
-    "clutter",
-    "degenerate",
-    "low_confidence",
-    "not_converged",
-    "unit_mismatch",
-}
 
 
 @pytest.fixture(scope="module")
@@ -83,38 +72,11 @@ def test_the_next_cloud_is_looked_for_where_the_last_one_was_until_a_reset(live,
     assert client.ask(clouds[1])["found_by"] in ("network", "search")
 
 
-def plane(rng):
-    return np.column_stack([rng.uniform(-0.1, 0.1, (2000, 2)), rng.normal(scale=1e-4, size=2000)])
-
-
-def line(rng):
-    return np.outer(rng.uniform(-0.1, 0.1, 2000), [0.6, 0.0, 0.8])
-
-
-BAD_INPUT = {
-    "an empty cloud": (lambda rng: np.empty((0, 3)), {"empty_cloud"}),
-    "five points": (lambda rng: rng.normal(size=(5, 3)), {"too_few_points", "unit_mismatch"}),
-    "all NaN": (lambda rng: np.full((1000, 3), np.nan), {"non_finite"}),
-    "one repeated point": (lambda rng: np.full((1000, 3), 0.1), REFUSALS_OF_SHAPE),
-    "a plane": (plane, REFUSALS_OF_SHAPE),
-    "a line": (line, REFUSALS_OF_SHAPE),
-    "a sphere": (lambda rng: 0.05 * se3_unit(rng.normal(size=(2000, 3))), REFUSALS_OF_SHAPE),
-    "noise": (lambda rng: rng.uniform(-0.1, 0.1, (2000, 3)), REFUSALS_OF_SHAPE),
-    "millimetres": (lambda rng: rng.normal(size=(1000, 3)) * 50.0, {"unit_mismatch"}),
-}
-
-
-def se3_unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-@pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input_is_refused_by_the_real_registration(live, name):
+def test_noise_is_refused_by_the_real_registration(live):
     node, client = live
-    make, reasons = BAD_INPUT[name]
     client.poses.clear()
-    values = client.ask(make(np.random.default_rng(0)))
-    assert values["last_refusal"].split(":")[0] in reasons, values
+    values = client.ask(np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)))
+    assert values["last_refusal"].split(":")[0] in {"ambiguous", "clutter", "degenerate", "low_confidence"}, values
     assert not client.poses
     assert node.process.poll() is None
 
@@ -151,14 +113,3 @@ def play(path, on_message):
     bag.reader.close()
     node.destroy_node()
     ros.try_shutdown()
-
-
-def test_services_work_on_the_real_node(live, bone):
-    node, client = live
-    assert client.call("set_enabled", SetBool.Request(data=False)).success
-    assert client.call("set_enabled", SetBool.Request(data=True)).success
-    client.ask(bones.partial(bone, np.eye(4)))
-    answer = client.call("register")
-    assert answer.success and answer.message.startswith("pose with confidence"), answer
-    answer = client.call("reload_model")
-    assert answer.success and "points" in answer.message

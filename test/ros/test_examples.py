@@ -223,6 +223,12 @@ def test_the_foxglove_layout_shows_topics_that_the_node_has():
     assert shown <= {"detection", *TOPICS} and "debug/residuals" in shown and "status" in shown
 
 
+def test_rviz_shows_topics_that_the_node_has(graph):
+    text = (ROOT / "rviz" / "register.rviz").read_text()
+    shown = re.findall(r"Topic:\n(?:.*\n)*?\s+Value: (\S+)", text)
+    assert len(shown) >= 5 and set(shown) <= graph["publish"] | graph["subscribe"]
+
+
 def test_the_service_and_the_container_start_the_program_and_stop_it_in_time():
     unit = (ROOT / "deploy" / "register_node.service").read_text()
     assert "exec ros2 run gapr_ros register_node" in unit and "KillSignal=SIGTERM" in unit

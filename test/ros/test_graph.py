@@ -29,11 +29,6 @@ def statuses(client):
     return {entry.name: entry for array in client.diagnostics for entry in array.status}
 
 
-def message_of(client, side):
-    entry = statuses(client).get(f"/{side}/register_node: input")
-    return "" if entry is None else entry.message
-
-
 def test_diagnostics_carry_the_full_name_and_the_model_as_hardware(blob_path, client, method):
     with node_in_thread(method, blob_path, namespace="/left"):
         wait_until(lambda: "/left/register_node: input" in statuses(client))

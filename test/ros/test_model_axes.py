@@ -48,11 +48,6 @@ def test_a_file_in_ras_that_is_read_as_it_is_names_the_parameter_whose_default_t
     )
 
 
-def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):
-    with pytest.raises(ConfigError, match="which says SPACE=RAS; use as_is"):
-        loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"), model_axes="lps_to_ras")
-
-
 def test_the_bone_of_a_label_map_is_named_by_its_label(tmp_path):
     sitk = pytest.importorskip("SimpleITK", reason="it writes the label map: pip install SimpleITK")
     voxels = np.zeros((40, 30, 30), dtype=np.uint8)

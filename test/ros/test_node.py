@@ -683,25 +683,11 @@ def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path
     np.testing.assert_allclose(prepared, points_mm * [-1.0, -1.0, 1.0], atol=1e-9)
 
 
-def test_a_guessed_model_unit_is_warned_about(tmp_path, client, method, capfd):
-    np.save(tmp_path / "unknown.npy", np.random.default_rng(2).normal(size=(400, 3)) * 0.05)
-    with node_in_thread(method, tmp_path / "unknown.npy", model_unit="auto"):
-        client.wait_for_state("active")
-    assert "taken to be in m; name the unit to be sure" in capfd.readouterr().err
-
-
 def test_the_log_says_what_is_loaded_and_where_clouds_are_waited_for(blob_path, client, method, capfd):
     with node_in_thread(method, blob_path, namespace="/left"):
         wait_until(lambda: client.values().get("state") == "active")
     lines = capfd.readouterr().err
     assert f"loading {blob_path}" in lines and "active, waits for clouds on /left/points (in m)" in lines
-
-
-def test_clouds_in_millimetres_are_taken_as_such(blob_path, client, method):
-    with node_in_thread(method, blob_path, cloud_unit="mm"):
-        client.wait_for_state("active")
-        assert client.ask(GOOD * 1000.0)["level"] == 0
-    np.testing.assert_allclose(method.calls[-1]["source"], GOOD * 1000.0, atol=1e-3)
 
 
 def test_no_exception_of_a_callback_ends_the_node(live):

@@ -8,6 +8,8 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+from imported import imported_roots
+
 ROOT = Path(__file__).parents[2]
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 NEEDED = re.compile(r"^(?:CORE|NETWORK|DATA|REPORTS|BAGS) = (\[.*?\])", re.MULTILINE | re.DOTALL)
@@ -35,16 +37,8 @@ KEYS = {
 }
 
 
-def imports(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name.split(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module.split(".")[0]
-
-
 def test_everything_that_the_ros_side_imports_is_asked_for_by_its_rosdep_key():
-    found = {name for path in FILES for name in imports(path)} - OWN - set(sys.stdlib_module_names)
+    found = {name for path in FILES for name in imported_roots(path)} - OWN - set(sys.stdlib_module_names)
     assert {"rclpy", "sensor_msgs", "launch", "tf2_ros", "rosbags"} <= found
     assert {KEYS.get(name, name) for name in found} <= DEPENDENCIES
 

@@ -2,30 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
-import time
 
-import bones
-import numpy as np
 import pytest
-from harness import NodeProcess
 
 from gapr_ros import register_node
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_process_with_0_even_while_it_registers(client, tmp_path, number):
-    bone = bones.bone()
-    model = bones.save(bone, tmp_path / "bone.npz")
-    node = NodeProcess(tmp_path, model_path=model, model_unit="mm")
-    client.wait_for_state("active")
-    client.send(bones.partial(bone, np.eye(4)))
-    time.sleep(0.3)
-    assert node.stop(number) == 0, node.log
-    assert "Traceback" not in node.log
-
 
 STOPPED_WHILE_STARTING = """
 import sys, rclpy, rclpy.executors

@@ -63,15 +63,6 @@ def a_pair(bone, angle_deg, seed=1):
     return se3.apply(T_source_target, kept + rng.normal(0, 0.3, kept.shape)), se3.inverse(T_source_target)
 
 
-@pytest.mark.parametrize("name", baselines.REGISTRY)
-def test_every_baseline_answers_a_rigid_pose_under_its_name_or_refuses(name, bone):
-    needs(name)
-    method = baselines.make(name)
-    result = method.register(a_pair(bone, 20.0)[0], method.prepare(bone))
-    assert result.method == name and result.seconds > 0.0
-    assert not result.ok or np.allclose(se3.nearest_rigid(result.T_target_source), result.T_target_source, atol=1e-3)
-
-
 @pytest.mark.parametrize("name", GLOBAL)
 def test_a_global_method_finds_a_pose_from_any_rotation(name, bone):
     needs(name)
@@ -79,6 +70,7 @@ def test_a_global_method_finds_a_pose_from_any_rotation(name, bone):
     source, T_true = a_pair(bone, 140.0)
     result = method.register(source, method.prepare(bone))
     rte, rre = se3.pose_error(result.T_target_source, T_true, source)
+    assert result.method == name and result.seconds > 0.0
     coarse_only = name in ("fpfh_ransac", "fgr", "kiss_matcher")
     assert rte < (10.0 if coarse_only else 1.0) and rre < (10.0 if coarse_only else 1.0)
 

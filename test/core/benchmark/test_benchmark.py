@@ -10,20 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmark_cases import make_pair, ok, record
+from benchmark_cases import make_pair, ok, record, timeless
 
 from gapr_core.benchmark import methods as known_methods
 from gapr_core.benchmark import records, runner
-from gapr_core.benchmark.table import TIMES
 from gapr_core.commands import benchmark
 from gapr_core.config import RegistrarConfig, SearchConfig
 from gapr_core.data.pair_files import facts_hash, load_facts, load_pair, pair_hash, save_pair
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.geometry import se3
-
-
-def timeless(rows):
-    return [{key: value for key, value in row.items() if key not in TIMES} for row in rows]
 
 
 def row_of(rows, protocol, method, bone="all"):

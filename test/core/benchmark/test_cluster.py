@@ -8,18 +8,14 @@ import time
 from itertools import islice
 
 import pytest
+from benchmark_cases import timeless
 
 from gapr_core.benchmark import runner
-from gapr_core.benchmark.table import TIMES
 from gapr_core.calibration import collect
 from gapr_core.calibration.pairs import Task
 from gapr_core.commands import benchmark
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.runtime import cluster
-
-
-def timeless(rows):
-    return [{key: value for key, value in row.items() if key not in TIMES} for row in rows]
 
 
 def test_the_table_of_a_cluster_is_that_of_one_process(pairs, fakes, tmp_path, in_process, dask_address):

@@ -14,7 +14,7 @@ from gapr_core.benchmark import checkout, geotransformer, methods, peer
 from gapr_core.benchmark.geotransformer import ORIGIN, Checkout
 from gapr_core.benchmark.peer import VOXEL
 from gapr_core.data.parametric import make_bone
-from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
+from gapr_core.errors import ConfigError, InvalidPointCloudError, WeightsError
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.training.config import TrainConfig
@@ -65,11 +65,6 @@ def test_its_pose_and_its_matches_are_read_from_its_output():
     np.testing.assert_allclose(found.target - found.source, 1.0)
     assert found.score.dtype == np.float64
     np.testing.assert_array_equal(code.own_pose({"estimated_transform": motion}, {}), np.eye(4))
-
-
-def test_a_folder_without_its_experiment_is_no_checkout(tmp_path):
-    with pytest.raises(MethodUnavailableError, match=r"without experiments/.*git clone .*GeoTransformer"):
-        Checkout.at(tmp_path)
 
 
 def test_targets_that_are_not_whole_are_not_trained_on(tmp_path):

@@ -27,14 +27,6 @@ RNG = np.random.default_rng(0)
 ORIGIN = Origin("peer_of_a_test", "Peer", "https://example.org/peer", "own/network.py", "a_library")
 
 
-def test_voxels_are_thinned_cloud_by_cloud():
-    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [1.2, 0.0, 0.0], [0.2, 0.2, 0.2]])
-    thinned, lengths = checkout.voxels(points, [3, 1], 1.0)
-    assert lengths == [2, 1]
-    found = sorted(map(tuple, np.round(thinned, 4).tolist()))
-    assert found == [(pytest.approx((0.2, 0.1, 0.1))), (pytest.approx((0.2, 0.2, 0.2))), pytest.approx((1.2, 0.0, 0.0))]
-
-
 @pytest.mark.parametrize("most", [40, None])
 def test_balls_hold_the_points_of_the_same_cloud_within_the_radius_nearest_first(most):
     points, queries = RNG.random((40, 3)), RNG.random((30, 3))

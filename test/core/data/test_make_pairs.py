@@ -255,12 +255,6 @@ def test_hidden_files_of_macos_are_no_meshes_and_two_files_of_one_subject_are_re
         anatomy.meshes(tmp_path)
 
 
-def test_no_parametric_person_is_in_two_splits():
-    people = [set(pool.parametric_people(split, 50)) for split in anatomy.SPLITS]
-    assert all(len(p) == 50 for p in people)
-    assert not (people[0] & people[1] or people[0] & people[2] or people[1] & people[2])
-
-
 def test_a_bone_that_the_anatomy_lacks_is_a_parametric_one_and_says_so(tmp_path):
     specimen = ball_specimen(person="a", bone="femur")
     arrays = {"points": specimen.surface.points[None], "faces": specimen.surface.faces, "person": np.array(["a"])}

@@ -69,6 +69,8 @@ def test_the_noise_of_a_depth_camera_grows_with_the_square_of_the_distance_and_w
         away_mm = np.linalg.norm(to_camera, axis=1)
         slant = np.clip(np.einsum("ni,ni->n", outward, to_camera) / away_mm, 0.15, 1.0)
         assert (along * np.sqrt(slant) / (away_mm / 500.0) ** 2).std() == pytest.approx(1.0, rel=0.1)
+        stated = np.median((away_mm / 500.0) ** 2 / np.sqrt(slant))
+        assert after.parameters["noise_mm"] == pytest.approx(stated, rel=0.02)
         assert aside.max() < 1e-9
 
 

@@ -298,7 +298,7 @@ def test_specks_are_left_out_and_said(tmp_path, caplog):
     assert np.abs(error_mm(surface.points)).max() < 1.5 and "1 specks" in caplog.text
 
 
-def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, caplog):
+def test_images_and_empty_label_maps_are_refused(tmp_path):
     affine, size = affine_of((3.0, 3.0, 3.0))
     image = sitk.Cast(image_of(voxels_of(affine, size), affine), sitk.sitkInt16) - 1000
     sitk.WriteImage(image, str(tmp_path / "ct.nii.gz"))
@@ -308,14 +308,6 @@ def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, c
         clouds.load(write(tmp_path / "empty.nrrd", np.zeros((9, 9, 9)), affine))
     with pytest.raises(InvalidPointCloudError, match="voxels of 7; got empty.nrrd: none, but zeros only; check the"):
         clouds.load(tmp_path / "empty.nrrd", options=options("7"))
-    for ending in ("nii", "nii.gz", "nrrd", "mha"):
-        whole = write(tmp_path / f"whole.{ending}", voxels_of(affine, size), affine).read_bytes()
-        cut = tmp_path / f"cut.{ending}"
-        for length in (0, 100, len(whole) - 40):
-            cut.write_bytes(whole[:length])
-            with pytest.raises(InvalidPointCloudError, match=f"cut.{ending}") as caught:
-                clouds.load(cut)
-            assert "\n" not in str(caught.value)
 
 
 def nifti_of(path, kind="Nifti1Image", millimetres=True, says_where=True):

@@ -90,12 +90,6 @@ def test_mrk_json_points_come_in_lps_and_undefined_ones_stay_behind(tmp_path, sp
     assert read.labels == ("L0", "L1", "L2")
 
 
-def test_written_markups_come_back(tmp_path):
-    markups.save(tmp_path / "a.mrk.json", markups.Markups(POINTS, ("a", "b", "c")), ["1.2 mm", "", ""])
-    read = markups.load(tmp_path / "a.mrk.json")
-    assert np.array_equal(read.points, POINTS) and read.labels == ("a", "b", "c")
-
-
 FLAT = {"coordinateSystem": "LPS", "controlPoints": [{"position": [1.0, 2.0]}] * 3}  # six numbers, no two points
 
 

@@ -6,7 +6,6 @@ import csv
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from gapr_core.training.ablation import cli as ablation
 from gapr_core.training.ablation import table as ablation_table
 from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
 
-ROOT = Path(__file__).parents[3]
 EXAM = Recipe(("paper", "L2"), ("femur",), 2, 0, "test", 2, "anatomy")
 BUDGET = TrainConfig(bones=("femur",), mix={"paper": 1.0}, pairs=4, batch=2, micro_batch=2, pool=1, validation_pairs=1)
 

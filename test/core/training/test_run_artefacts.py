@@ -196,14 +196,20 @@ def test_files_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, fil
         call(tmp_path)
 
 
-@pytest.mark.parametrize("damage", ["random", "cut", "empty", "of something else"])
+def flipped(data, at):
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize("damage", ["random", "cut", "empty", "of something else", "a bit of the step", "a bit"])
 def test_a_checkpoint_that_is_damaged_is_refused_by_its_name(toy, tmp_path, damage):
     network, ema = (GAPRNet(toy.small_config(superpoints=(10, 20), width=8, global_width=16)) for _ in range(2))
     optimizer, path = torch.optim.AdamW(network.parameters()), tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, network, ema, optimizer, {"step": 1})
     assert load_checkpoint(path, network, ema, optimizer) == {"step": 1}
     whole = path.read_bytes()
-    path.write_bytes({"random": np.random.default_rng(0).bytes(500), "cut": whole[:-9]}.get(damage, b""))
+    bits = {"a bit": flipped(whole, len(whole) - 5), "a bit of the step": flipped(whole, whole.index(b"step") + 8)}
+    made = {"random": np.random.default_rng(0).bytes(500), "cut": whole[:-9], **bits}
+    path.write_bytes(made.get(damage, b""))
     if damage == "of something else":
         save_file({"a": torch.zeros(1)}, path)
     with pytest.raises(WeightsError, match="a checkpoint of this configuration; got .*checkpoint.safetensors: .*; re"):

@@ -7,16 +7,13 @@ import pytest
 import torch
 
 from gapr_core.geometry import se3
-from gapr_core.model.pyramid import Frame, build_cloud, target_frame
+from gapr_core.model.pyramid import Frame
 from gapr_core.training.targets import fine_labels, join, to_units, training_pair, true_patch_pairs
 
 
 @pytest.fixture(scope="module")
 def pair(toy, config):
-    frame = target_frame(toy.bone(), config)
-    moved = se3.apply(toy.motion(3), toy.view(toy.bone(700, 1)))
-    source, target = build_cloud(moved, frame, config), build_cloud(toy.bone(), frame, config)
-    return training_pair(source, target, se3.inverse(toy.motion(3)), frame)
+    return toy.pair(config)
 
 
 def test_the_motion_in_units_equals_the_motion_in_millimetres(pair, toy):

@@ -410,14 +410,6 @@ def test_the_learning_rate_rises_then_falls_to_its_final_share():
     assert rates[:10] == sorted(rates[:10]) and rates[10:] == sorted(rates[10:], reverse=True)
 
 
-def test_a_drawn_person_lies_in_the_span_of_the_people():
-    rng = np.random.default_rng(0)
-    mean, mode = rng.normal(size=(40, 3)) * 50, rng.normal(size=(40, 3))
-    model = ShapeModel(mean, np.array([-1.0, 0.0, 1.0])[:, None, None] * mode, np.zeros((1, 3), dtype=int))
-    drawn = model.draw(rng).points - mean
-    assert np.linalg.matrix_rank(np.stack([drawn.ravel(), mode.ravel()]), tol=1e-6) == 1
-
-
 def test_drawn_people_vary_as_the_people_do():
     """By the covariance of a sample of three, whose divisor is two."""
     rng = np.random.default_rng(0)

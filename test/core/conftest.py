@@ -103,7 +103,7 @@ def anatomy_folder() -> Path:
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def dask_cluster():
     """Makes a Dask cluster; with `processes=False` its only worker is a thread of this process."""
     distributed = pytest.importorskip("distributed", reason="--dask is optional: pip install '.[cluster]'")
@@ -120,7 +120,7 @@ def dask_cluster():
         each.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def dask_address(dask_cluster):
     """Of a cluster whose only worker is a thread of this process."""
     return dask_cluster(processes=False).scheduler_address

@@ -45,7 +45,7 @@ def test_damaged_label_maps_and_bags_are_read_or_refused_in_a_process_that_survi
 def test_damaged_bytes_behind_a_header_make_no_other_surface_where_there_is_a_checksum(monkeypatch):
     monkeypatch.setattr(packed.child, "_limit", lambda limits, seconds: None)
     monkeypatch.setattr(packed.label_map, "_in_a_child", packed.in_this_process)
-    found = {outcome for _, outcome in packed.run(300, 1)}
+    found = {outcome for _, outcome in packed.run(100, 1)}
     assert {"refused", "same"} <= found <= {"refused", "same", "warned", "moved"}
 
 

@@ -40,7 +40,7 @@ def test_the_table_touches_the_bone_from_below(pair):
     assert 0.10 <= is_bone.mean() <= 0.60
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_camera_is_at_most_50_degrees_off_the_upright(seed):
     """Seen from where it looks at, which is on the bone, near the middle of what it sees of it."""
     pair = make_pair("scene-table", parametric_specimen("tibia", 3), seed)

@@ -318,7 +318,7 @@ def test_a_source_of_few_points_is_judged_with_those_just_before_it(quick, sizes
     assert sum(map(len, found)) == judged
 
 
-@pytest.mark.parametrize("size", [1, 6])
+@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.slow), 6])
 @pytest.mark.timeout(400)  # seventy registrations
 def test_a_bone_that_moved_is_noticed_where_every_source_is_a_few_points(quick, frames, prepared, size):
     """As a pointer sends them. One of fewer than 20 points was never looked at, and old poses went out at .99."""

@@ -28,7 +28,7 @@ from gapr_core.registration.fit.verification import verify
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposer
+from gapr_core.registration.proposals.search import Proposer
 from gapr_core.runtime.console import say
 
 CONFIG = RegistrarConfig(num_threads=1)
@@ -82,7 +82,7 @@ def measure(pair: Pair, registrar: Registrar, methods: dict[str, Proposer]) -> R
 def one_list(proposer: Proposer, source: PreparedSource, target: PreparedTarget, pair: Pair) -> Row:
     """Rank of the first near pose, recall of the first pose raw and refined, of the whole list, and the times."""
     start = time.perf_counter()
-    poses = proposer.propose(source, target, np.random.default_rng(0)).poses
+    poses = proposer.propose(source, target, np.random.default_rng(0))
     proposed = time.perf_counter()
     if not len(poses):
         return {

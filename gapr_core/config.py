@@ -216,7 +216,6 @@ class RegistrarConfig(Settings):
     max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
     sure: float = setting(0.95, "confidence from which no other proposer and no region is tried", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
-    seed: int = setting(0, "seed of proposers that draw; other draws are always the same", low=0, high=2**31 - 1)
 
     @property
     def worth_checking(self) -> float:

@@ -73,7 +73,7 @@ def ransac_pose(found: Correspondences, frame: Frame) -> Array:
     from gapr_core.model.pyramid import matching_radius
 
     radius_mm = matching_radius(frame) * frame.scale_mm
-    poses, _ = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
+    poses = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
     if not len(poses):
         raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
     return sharpened(poses[0], found, radius_mm)

@@ -16,13 +16,13 @@ ROUNDS = 5  # fits with each radius
 
 def ransac(
     found: Correspondences, radius_mm: float, rng: np.random.Generator, draws: int = 2000, count: int = 32
-) -> tuple[Array, Array]:
+) -> Array:
     """Fit poses to random triples of correspondences (Fischler and Bolles 1981), drawn by score, with equal sides.
 
     Args and returns: as `local_to_global`; `draws` triples are tried.
     """
     if len(found.score) < 3:
-        return np.empty((0, 4, 4)), np.empty(0)
+        return np.empty((0, 4, 4))
     triples = rng.choice(len(found.score), (draws, 3), p=found.score / found.score.sum())
     p, q = found.source[triples], found.target[triples]
     sides_p, sides_q = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))

@@ -35,9 +35,8 @@ from gapr_core.registration.confidence.features import FEATURES_OF
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposals, Proposer
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
-from gapr_core.registration.proposals.search import NormalAlignedSearch
+from gapr_core.registration.proposals.search import NormalAlignedSearch, Proposer
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.streams.memory import PreviousPoses
@@ -215,13 +214,13 @@ class AskedOnce:
 
     def __post_init__(self) -> None:
         self.name = self.proposer.name
-        self._last: tuple[Array, Array, Proposals] | None = None
+        self._last: tuple[Array, Array, Array] | None = None
 
     def prepare(self, target: PreparedTarget) -> None:
         """Prepare the proposer."""
         self.proposer.prepare(target)
 
-    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
         """Propose as the proposer, or return its last answer for the same points and target."""
         last = self._last
         if last is None or last[1] is not target.points or not np.array_equal(last[0], source.points):

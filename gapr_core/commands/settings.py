@@ -10,7 +10,7 @@ from gapr_core.runtime import settings
 from gapr_core.runtime.console import say
 
 USERS = ("sensor.", "covariance.model_mm", "target.flat_end_mm2", "other_bone_prior", "min_confidence", "max_tre_mm",
-         "guide", "num_threads", "seed")  # fmt: skip
+         "guide", "num_threads")  # fmt: skip
 
 
 def add_arguments(parser: ArgumentParser) -> None:

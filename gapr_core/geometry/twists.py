@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import gammaincinv
 
 from gapr_core.geometry import se3
 
@@ -85,3 +86,17 @@ def mean_square(points: Array, centre: Array) -> Array:
 def predicted_rmse_mm(covariance: Array, points: Array, centre: Array) -> float:
     """Root-mean-square error over points (M, 3), mm, under a pose covariance (6, 6) about `centre` (3,)."""
     return float(np.sqrt(np.trace(mean_square(points, centre) @ covariance)))
+
+
+def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = 0.95) -> float:
+    """Bound the error over points (M, 3), mm, with probability `quantile`; one point for a single target.
+
+    With A of `mean_square` and a normal error of covariance C, TRE^2 is a weighted sum of chi-square variables. Its
+    mean is tr(A C) (Fitzpatrick 1998). The quantile is that of the scaled chi-square with the same mean and variance
+    (Satterthwaite 1946).
+    """
+    product = mean_square(points, centre) @ covariance
+    mean, variance = np.trace(product), 2.0 * np.trace(product @ product)
+    scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
+    chi_square = 2.0 * gammaincinv(freedom / 2.0, quantile)  # as `scipy.stats.chi2.ppf`, which takes long to import
+    return float(np.sqrt(scale * chi_square))

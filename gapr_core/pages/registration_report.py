@@ -21,7 +21,7 @@ from gapr_core.geometry import se3
 from gapr_core.pages import palette, report, views
 from gapr_core.pages.report import Image
 from gapr_core.registration.caveats import loosest_turn
-from gapr_core.registration.confidence.feature_labels import FEATURE_LABELS
+from gapr_core.registration.confidence.features import FEATURE_LABELS
 from gapr_core.results import Effect, RegistrationResult, RegistrationStatus, Residuals, confidence_text
 from gapr_core.runtime import origin
 

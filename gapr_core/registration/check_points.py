@@ -19,15 +19,13 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import distance_jacobian, mean_square
+from gapr_core.geometry.twists import bound_mm, distance_jacobian, mean_square
 from gapr_core.registration.fit import kernels
 from gapr_core.registration.problem import sensor
 from gapr_core.registration.problem.sensor import Errors, offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import as_config, check_call
-from gapr_core.registration.uncertainty import target_error as precision
-from gapr_core.registration.uncertainty.covariance import CORRELATION_MM
-from gapr_core.registration.uncertainty.linear_model import smooth_correlation
+from gapr_core.registration.uncertainty.linear_model import CORRELATION_MM, smooth_correlation
 from gapr_core.results import PointCheck, RegistrationResult, Verdict
 
 Array = NDArray[np.float64]
@@ -87,11 +85,11 @@ def check_points(
     weighted = np.linalg.solve(R, J)
     information = J.T @ weighted
     alone = np.linalg.inv(np.linalg.inv(LOOSE) + information)
-    unseen_mm = precision.bound_mm(alone, target.points, centre)
+    unseen_mm = bound_mm(alone, target.points, centre)
     together = np.linalg.inv(np.linalg.inv(covariance) + information)
     error = together @ weighted.T @ distance_mm[near]
     shown_mm = float(np.sqrt(error @ mean_square(target.points, centre) @ error))
-    tre95_mm = shown_mm + precision.bound_mm(together, target.points, centre)  # a mean square root is no larger
+    tre95_mm = shown_mm + bound_mm(together, target.points, centre)  # a mean square root is no larger
     best = _next(alone, target, centre, float(np.diag(R).mean()) if near.any() else 1.0)
     return PointCheck(
         _verdict(probability, shown_mm, max(unseen_mm, tre95_mm), within_mm), probability, points, distance_mm,

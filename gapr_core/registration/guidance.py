@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.geometry import sampling, se3
-from gapr_core.geometry.twists import distance_jacobian
+from gapr_core.geometry.twists import bound_mm, distance_jacobian
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.fit.refinement import distances_mm
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]
@@ -99,7 +98,7 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
     for members in patches.values():
         J = distance_jacobian(target.points[members], target.normals[members], centre)
         covariance = np.asarray(np.linalg.inv(known + information(J, points, noise_mm, bias_mm)), np.float64)
-        bounds.append(over_all * assessment.factor95 * precision.bound_mm(covariance, anchors, centre))
+        bounds.append(over_all * assessment.factor95 * bound_mm(covariance, anchors, centre))
     return np.array(bounds)
 
 

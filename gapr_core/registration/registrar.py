@@ -30,6 +30,7 @@ from gapr_core.registration.checks import image, table
 from gapr_core.registration.checks.assess import assess_fit, bias_corrected, follows_both_cortices
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.conclude import conclude, unit_question
+from gapr_core.registration.checks.deformation import deformation
 from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.fit import alternatives
 from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
@@ -42,8 +43,7 @@ from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals import regions
-from gapr_core.registration.proposals.base import Proposer
-from gapr_core.registration.proposals.search import NormalAlignedSearch
+from gapr_core.registration.proposals.search import NormalAlignedSearch, Proposer
 from gapr_core.registration.scenes import clutter, look_agreement, scene_fit
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.scene import Look, Scene, Viewpoint
@@ -62,6 +62,7 @@ Enough = Callable[[Assessment], bool]  # True for an unsure answer that needs no
 
 NO_POSES = np.empty((0, 4, 4))
 NO_POSE = Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
+SEED = 0  # of proposers that draw
 MOST_HOPELESS = 2  # rounds in a row of a cloud that may be no scene: later ones hardly ever have an accepted pose
 WITHIN_MM = 15.0  # root mean square over the source from which refinement reaches the same pose
 
@@ -167,8 +168,8 @@ class Registrar:
             InvalidPointCloudError: wrong shape, type or extent of the source; a target that is not prepared. An
                 `initial` that is no rigid pose. A `viewpoint` that sees nothing of the cloud, or more than 16 of them.
         """
-        clock = Clock()
-        return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
+        start, clock = check_call(target, initial), Clock()
+        return self.conclude(self.assess(source, target, start, viewpoint, clock), clock)
 
     @single_threaded_libraries
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
@@ -189,27 +190,16 @@ class Registrar:
         self,
         source: ArrayLike,
         target: PreparedTarget,
-        initial: ArrayLike | None = None,
+        start: Array = NO_POSES,
         viewpoint: Viewpoint | None = None,
         clock: Clock | None = None,
         enough: Enough = never,
     ) -> Assessment | Refusal:
-        """Register up to the thresholds of the user; an answer that is `enough` ends the rounds."""
-        check_call(target, initial)
-        start = NO_POSES if initial is None else inputs.rigid(initial, "initial pose")[None]
-        return self.assess_from(source, target, start, viewpoint, clock or Clock(), enough)
+        """Register up to the thresholds of the user; an answer that is `enough` ends the rounds.
 
-    def assess_from(
-        self,
-        source: ArrayLike,
-        target: PreparedTarget,
-        start: Array,
-        viewpoint: Viewpoint | None,
-        clock: Clock,
-        enough: Enough = never,
-    ) -> Assessment | Refusal:
-        """Assess with start poses (K, 4, 4) T_target_source, mm, each rigid."""
-        target = offset_surface(target, self.config.sensor)
+        `start` are poses (K, 4, 4) T_target_source, mm, each rigid, to try as well.
+        """
+        target, clock = offset_surface(target, self.config.sensor), clock or Clock()
         if viewpoint is not None:
             return self._as_scene(scenes.split(source, viewpoint), target, start, clock, enough)
         prepared = sources.prepare(source, self.config.source, self.config.num_threads)
@@ -240,8 +230,7 @@ class Registrar:
         """Run one proposer after the other, each with the poses of all so far, until an answer is good enough."""
         config, assessment, given = self.config, None, len(poses)
         for number, proposer in enumerate(self.proposers, 1):
-            rng = np.random.default_rng(config.seed)
-            proposed = proposer.propose(source, target, rng).poses
+            proposed = proposer.propose(source, target, np.random.default_rng(SEED))
             clock.lap("propose")
             if not len(proposed):
                 continue  # a given pose needs a rival
@@ -254,15 +243,12 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, self.classifier, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            is_known = not given or self._is_near(assessment, poses[given:])
+            # a proposer reached the best pose, too: else its poses are no rivals to a given one
+            others, count = poses[given:], config.verification.markers
+            is_known = not given or support(fit.T[None], others, source, count, WITHIN_MM)[0] > 0.0
             if enough(assessment) or (assessment.reaches(config.sure_from) and is_known):
                 break
         return assessment
-
-    def _is_near(self, assessment: Assessment, proposed: Array) -> bool:
-        """Return True where a proposer reached the best pose, too: else its poses are no rivals to a given one."""
-        count, T = self.config.verification.markers, assessment.fit.T[None]
-        return bool(support(T, proposed, assessment.source, count, WITHIN_MM)[0] > 0.0)
 
     def _checked(
         self, assessment: Assessment, clock: Clock, enough: Enough, mirrored_scene: image.RegisterScene | None = None
@@ -279,14 +265,14 @@ class Registrar:
             clock.lap("refine")
         assessment = assessment.corrected(self.precision)
         if assessment.reaches(config.worth_checking):
-            for check in table.WIDENING:
-                assessment = check(assessment, config)
+            found = deformation(assessment.fit)
+            assessment = assessment if found is None else assessment.with_finding(*found)
             clock.lap("assess")
         return assessment
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
         """Find poses of the mirror image of a source with the first proposer."""
-        poses = self.proposers[0].propose(flipped, target, np.random.default_rng(self.config.seed)).poses
+        poses = self.proposers[0].propose(flipped, target, np.random.default_rng(SEED))
         clock.lap("propose")
         if not len(poses):
             return None
@@ -407,13 +393,12 @@ def pretrained_network(device: str = "cpu", weights: str | Path | None = None) -
     return NetworkProposer.from_weights(weights or SHIPPED, device)
 
 
-def check_call(target: object, initial: ArrayLike | None) -> None:
-    """Raise for a target that is not prepared, or an `initial` that is no rigid pose."""
+def check_call(target: object, initial: ArrayLike | None) -> Array:
+    """Return start poses (K, 4, 4). Raise for a target that is not prepared, or an `initial` that is no rigid pose."""
     if not isinstance(target, PreparedTarget):
         how = "pass what `prepare` returns for it"
         raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
-    if initial is not None:
-        inputs.rigid(initial, "initial pose")
+    return NO_POSES if initial is None else inputs.rigid(initial, "initial pose")[None]
 
 
 def asking_the_unit(refusal: Refusal, source: Array, target: PreparedTarget) -> Refusal:

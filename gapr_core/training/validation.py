@@ -121,7 +121,7 @@ def score_pair(network: GAPRNet, v: ValidationPair, device: torch.device) -> Sco
     output = network(pair.source, pair.target)
     found = correspondences_mm(output.matches, v.pair.source, v.pair.target)
     radius_mm = float(v.pair.radius[0]) * float(v.pair.source.scale_mm[0])
-    poses, _ = local_to_global(found, 1.5 * radius_mm)
+    poses = local_to_global(found, 1.5 * radius_mm)
     errors = [se3.pose_error(T, v.T_target_source, v.source_mm) for T in poses] or [PoseError(np.inf, 180.0)]
     near = [error.within(NEAR_MM, NEAR_DEG) for error in errors]
     coarse, fine = inlier_ratios(output, pair.source, pair)

@@ -77,7 +77,7 @@ REGISTER --set min_confidence=7
 REGISTER --set min_confidence
 REGISTER --set nothing=1
 REGISTER --set search.keep=1.5
-REGISTER --method icp --set seed=1
+REGISTER --method icp --set min_confidence=0.9
 REGISTER --method icp --json .
 REGISTER --method icp --json cloud.npy/a.json
 REGISTER --method icp --json /proc/a.json
@@ -206,10 +206,10 @@ def test_a_setting_from_a_file_and_one_from_the_command_line_reach_the_method(fo
 
     parser = argparse.ArgumentParser()
     options.add_method(parser)
-    (folder / "mine.yaml").write_text("min_confidence: 0.75\nseed: 1\n")
-    args = parser.parse_args(["--method", "gapr_search", "--config", "mine.yaml", "--set", "seed=7"])
+    (folder / "mine.yaml").write_text("min_confidence: 0.75\nnum_threads: 1\n")
+    args = parser.parse_args(["--method", "gapr_search", "--config", "mine.yaml", "--set", "num_threads=7"])
     method = methods.make(args.method, options.registrar_config(args))
-    assert method.config.min_confidence == 0.75 and method.config.seed == 7
+    assert method.config.min_confidence == 0.75 and method.config.num_threads == 7
 
 
 def test_a_missing_library_names_the_extra_that_installs_it(capsys, monkeypatch):

@@ -246,7 +246,8 @@ def test_the_misfit_is_the_rms_height_of_the_neighbours_above_the_quadric_up_to_
 def test_the_variance_of_a_surface_element_is_its_gain_times_the_mean_square_misfit(femur_cloud, gain, count):
     target = targets.prepare(femur_cloud, config=TargetConfig(misfit_gain=gain, misfit_neighbours=count), num_threads=1)
     others = cKDTree(target.points).query(target.points, k=count + 1)[1][:, 1:]
-    misfit = quadrics.misfit_mm(target.points, target.normals, target.shapes, others)
+    shapes = target.elements[:, [6, 7, 8, 7, 9, 10, 8, 10, 11]].reshape(-1, 3, 3)
+    misfit = quadrics.misfit_mm(target.points, target.normals, shapes, others)
     assert target.elements[:, 12] == pytest.approx(gain * misfit**2, abs=1e-12)
     assert misfit.max() > 0.05
 

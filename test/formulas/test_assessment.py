@@ -8,7 +8,7 @@ import tiny
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration.checks import assess
+from gapr_core.registration.checks import assess, assessment
 from gapr_core.registration.checks.assess import assess_fit, follows_both_cortices
 from gapr_core.registration.checks.assessment import shared_probability
 from gapr_core.registration.confidence.classifier import Classifier, bone_probability
@@ -79,8 +79,9 @@ def test_hypotheses_begin_with_the_refined_pose_and_share_the_confidence(a):
         (1.0, [1.0, 1.0], 30.0, [1.0, 0.0]),
     ],
 )
-def test_a_rival_gets_its_likelihood_of_what_is_left(best, scores, n, expected):
-    assert shared_probability(best, np.array(scores), n) == pytest.approx(expected, abs=1e-12)
+def test_a_rival_gets_its_likelihood_of_what_is_left(monkeypatch, best, scores, n, expected):
+    monkeypatch.setattr(assessment, "INDEPENDENT_POINTS", n)
+    assert shared_probability(best, np.array(scores)) == pytest.approx(expected, abs=1e-12)
 
 
 def test_residuals_are_those_of_all_points_that_the_pose_rests_on(a):

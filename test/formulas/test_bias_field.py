@@ -29,7 +29,7 @@ def fit():
     signed = rng.normal(0.0, 0.8, COUNT)
     weights[[3, 9]], signed[3] = 0.0, np.nan
     moved = rng.uniform(-20.0, 20.0, (COUNT, 3)) + [50.0, -10.0, 5.0]
-    return Fit(np.eye(4), SIGMA_MM, signed, weights, normals, np.zeros(COUNT, dtype=np.int64), moved)
+    return Fit(np.eye(4), SIGMA_MM, signed, weights, normals, moved)
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +74,15 @@ def test_noise_along_the_normal_does_not_pass_for_a_bias():
     normals = normals[normals[:, 2] > 0.7][:4000]
     signed = rng.normal(0.0, 1.0, len(normals))
     moved, weights = (25.0 + signed[:, None]) * normals, np.ones(len(normals))
-    cap = Fit(np.eye(4), 1.0, signed, weights, normals, np.zeros(len(normals), dtype=np.int64), moved)
+    cap = Fit(np.eye(4), 1.0, signed, weights, normals, moved)
 
-    def largest(places):
-        information, score = NormalEquations.of(cap, bias_field._spanned(places, weights > 0.0, 20.0, 60))._fields_alone
+    def largest(spanned):
+        information, score = NormalEquations.of(cap, spanned)._fields_alone
         counted = information > 0.03 * information[-1]
         return (score[counted] ** 2 / information[counted]).max()
 
-    np.testing.assert_array_equal(fields(cap, 20.0, 60), bias_field._spanned(cap.feet, weights > 0.0, 20.0, 60))
-    assert largest(cap.feet) < 15.0 < 30.0 < largest(cap.moved)
+    of_the_points = fields(replace(cap, signed_mm=np.zeros(len(normals))))  # each is its own foot point
+    assert largest(fields(cap)) < 15.0 < 30.0 < largest(of_the_points)
 
 
 def test_fields_are_spanned_by_as_many_inliers_as_asked_for(fit):
@@ -222,7 +222,7 @@ def test_as_few_points_as_a_pose_has_unknowns_say_nothing_of_the_design_effect(f
     """A motion fits them all: the scores that are left are rounding, and would pass for a very small noise."""
     few = replace(fit, weights=np.where(np.cumsum(fit.weights > 0.0) <= count, fit.weights, 0.0))
     assert np.count_nonzero(few.weights) == count
-    assert (equations_of(few, 20.0, 60).design_effect == 1.0) == (count <= 6)
+    assert (equations_of(few).design_effect == 1.0) == (count <= 6)
 
 
 def test_a_design_effect_is_a_variance_of_all_points(fit, spanned):
@@ -248,5 +248,5 @@ def test_points_that_err_alike_in_clumps_have_a_design_effect(clump, least, most
     normals = np.column_stack([x, y, np.sqrt(1.0 - x**2 - y**2)])
     signed = np.repeat(rng.normal(0.0, 0.5, len(middles)), clump)
     moved = (60.0 + signed[:, None]) * normals
-    cap = Fit(np.eye(4), 0.5, signed, np.ones(3200), normals, np.zeros(3200, dtype=np.int64), moved)
-    assert least < equations_of(cap, 20.0, 80).design_effect < most
+    cap = Fit(np.eye(4), 0.5, signed, np.ones(3200), normals, moved)
+    assert least < equations_of(cap).design_effect < most

@@ -12,10 +12,9 @@ from tiny import ellipsoid, on_ellipsoid, plane
 from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.geometry.twists import bound_mm, predicted_rmse_mm
 from gapr_core.registration import check_points as module
 from gapr_core.registration.check_points import check_points as check
-from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals, Verdict
 
 EXACT = RegistrarConfig(
@@ -105,14 +104,14 @@ def test_what_stays_unseen_is_the_bound_of_a_pose_of_which_only_these_points_are
     assert flat.verdict is Verdict.SAYS_LITTLE and flat.probability > 0.9
     free = np.zeros((6, 6))
     free[[0, 1, 5], [0, 1, 5]] = [20.0**2, 20.0**2, np.radians(20.0) ** 2]
-    assert flat.unseen_mm == pytest.approx(precision.bound_mm(free, target.points, answer().centre_mm), rel=0.01)
+    assert flat.unseen_mm == pytest.approx(bound_mm(free, target.points, answer().centre_mm), rel=0.01)
 
 
 def test_spread_points_show_every_error_and_together_with_the_registration_they_bound_it_more_tightly():
     target = ellipsoid(count=4000)
     result = answer()
     few, many = (check(on_ellipsoid(count, 5), target, result, EXACT) for count in (4, 40))
-    registration_mm = precision.bound_mm(SMALL, target.points, result.centre_mm)
+    registration_mm = bound_mm(SMALL, target.points, result.centre_mm)
     assert few.unseen_mm > 4.0 > many.unseen_mm
     assert registration_mm > few.tre95_mm > many.tre95_mm
     assert few.verdict is Verdict.SAYS_LITTLE and many.verdict is Verdict.HOLDS
@@ -130,7 +129,7 @@ def test_information_adds_up():
     found = check(points, target, result, EXACT)
     together_mm = found.tre95_mm - found.shown_mm
     for bound, prior in ((found.unseen_mm, loose), (together_mm, np.linalg.inv(SMALL))):
-        wanted = precision.bound_mm(np.linalg.inv(prior + information), target.points, result.centre_mm)
+        wanted = bound_mm(np.linalg.inv(prior + information), target.points, result.centre_mm)
         assert bound == pytest.approx(wanted, rel=1e-4)
 
 
@@ -174,9 +173,7 @@ def test_the_error_that_is_shown_is_the_likeliest_one():
     moves = likeliest[:3] + np.cross(likeliest[3:], target.points - result.centre_mm)
     assert found.shown_mm == pytest.approx(np.sqrt((moves**2).sum(axis=1).mean()), rel=1e-3)
     left = np.linalg.inv(rows.T @ rows)
-    assert found.tre95_mm == pytest.approx(
-        found.shown_mm + precision.bound_mm(left, target.points, result.centre_mm), rel=1e-3
-    )
+    assert found.tre95_mm == pytest.approx(found.shown_mm + bound_mm(left, target.points, result.centre_mm), rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -187,9 +187,7 @@ def test_support_counts_what_the_middle_step_left_within_the_distance(scene, tar
 def test_given_poses_come_first_and_each_hypothesis_names_its_region(scene, target, refined, monkeypatch):
     found = {0: shifts(1.0, 2.0), 1: shifts(3.0)}
     by_centre = {tuple(region.centre): found[k] for k, region in enumerate(scene.regions)}
-    monkeypatch.setattr(
-        clutter.regions, "search", lambda region, *_: SimpleNamespace(poses=by_centre[tuple(region.centre)])
-    )
+    monkeypatch.setattr(clutter.regions, "search", lambda region, *_: by_centre[tuple(region.centre)])
     pool = clutter.propose(scene, target, shifts(7.0), CONFIG, 1)
     assert places(pool.poses) == [7.0, 1.0, 2.0, 3.0] and pool.region.tolist() == [-1, 0, 0, 1]
     assert pool.poses[:, 1, 3] == pytest.approx([0.0, 1.0, 1.0, 1.0]) and pool.scores.tolist() == [0.0] * 4

@@ -8,8 +8,7 @@ import tiny
 
 from gapr_core.config import RegistrarConfig, SensorConfig, SourceConfig
 from gapr_core.registration.checks.conclude import by_threshold, conclude, standoff_question, unit_question
-from gapr_core.registration.confidence.feature_labels import FEATURE_LABELS, against
-from gapr_core.registration.confidence.features import FEATURES_OF
+from gapr_core.registration.confidence.features import FEATURE_LABELS, FEATURES_OF, against
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.scenes.scene_fit import mostly_clutter
 from gapr_core.results import Effect, Finding, RegistrationStatus

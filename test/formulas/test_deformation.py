@@ -10,39 +10,39 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
 from gapr_core.registration.checks import deformation as deformations
 from gapr_core.registration.checks.deformation import (
-    APART,
-    LAYERED,
-    STRAINED,
+    LIMITS,
     TEXTS,
     deformation,
     of_deformations,
-    of_looks,
+    of_motion,
+    step_times,
     with_looks,
 )
 from gapr_core.registration.checks.unknowns import (
     BIASES_MM,
     CELLS,
-    CORRELATION_MM,
     NOTHING,
     SHARED_MM,
     SIZES_MM,
     Blocks,
+    Shown,
     blocks,
     motions,
     shown,
 )
 from gapr_core.registration.fit.refinement import Fit
 from gapr_core.registration.streams.accumulator import MOVES
-from gapr_core.registration.streams.motion_test import of_motion, step_times
 from gapr_core.registration.uncertainty.covariance import PoseUncertainty, covariance_added_by
+from gapr_core.registration.uncertainty.linear_model import CORRELATION_MM
 from gapr_core.results import Effect
 
 NOISE_MM = 0.4
+STRAINED, APART, LAYERED = LIMITS["strained"], LIMITS["apart"], LIMITS["layered"]
 
 
 def of_strain(fit):
     found = of_deformations(fit)
-    return found["strained"].shown if found else NOTHING
+    return found["strained"][0] if found else NOTHING
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -50,7 +50,7 @@ def fit_of(points, normals, errors, weights=None):
     signed = np.einsum("ni,ni->n", normals, errors)
     weights = np.ones(len(points)) if weights is None else weights
     moved = points + signed[:, None] * normals
-    return Fit(np.eye(4), NOISE_MM, signed, weights, normals, np.zeros(len(points), dtype=np.int64), moved)
+    return Fit(np.eye(4), NOISE_MM, signed, weights, normals, moved)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_a_bone_that_moves_while_it_is_measured_is_found_and_one_at_rest_is_not(
         [se3.apply(se3.exp(np.array(motion) * t, np.zeros(3)), p[None])[0] for t, p in zip(time, points, strict=True)]
     )
     creeping, resting = (fit_of(points, normals, noise(2400) + off) for off in (moved - points, 0.0))
-    found, nothing = (of_motion(fit, order).shown for fit in (creeping, resting))
+    found, nothing = (of_motion(fit, order)[0] for fit in (creeping, resting))
     assert found.log_ratio > MOVES > nothing.log_ratio
     assert found.size_mm > 3.0 * nothing.size_mm and 0.5 < found.size_mm < 5.0
 
@@ -142,9 +142,9 @@ def test_what_does_not_go_with_time_is_no_creep(seen):
     points, normals = seen(2400)
     order = np.random.default_rng(6).permutation(np.repeat(np.arange(12), 200))
     off = np.random.default_rng(7).choice([-1.5, 1.5], 2400)[:, None] * [0.0, 0.0, 1.0]
-    assert of_motion(fit_of(points, normals, noise(2400) + off), order).shown.log_ratio < 4.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order)[0].log_ratio < 4.0
     off = 3.0 * np.sign(order - 5.5)[:, None] * [0.0, 0.0, 1.0]
-    assert of_motion(fit_of(points, normals, noise(2400) + off), order).shown.log_ratio > 40.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order)[0].log_ratio > 40.0
 
 
 @pytest.mark.parametrize("strain", [np.diag([0, 0, 0.03]), np.diag([0.05, 0, 0]),
@@ -179,11 +179,11 @@ def test_another_size_is_a_strain(seen):
 def test_few_points_or_one_source_say_nothing(seen):
     points, normals = seen(199)
     fit = fit_of(points, normals, noise(199) + 0.2 * points)
-    assert of_strain(fit) == NOTHING == of_motion(fit, np.arange(199)).shown
+    assert of_strain(fit) == NOTHING == of_motion(fit, np.arange(199))[0]
     points, normals = seen(200)
     fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
     assert of_strain(fit).log_ratio > 3.0
-    assert of_motion(fit, np.zeros(200, dtype=np.int64)).shown == NOTHING
+    assert of_motion(fit, np.zeros(200, dtype=np.int64)) == (NOTHING, None)
 
 
 def test_halves_move_against_each_other_along_each_principal_axis(seen):
@@ -211,10 +211,10 @@ def test_two_halves_in_two_poses_are_found_and_one_piece_is_not(seen, motion, ax
     above = along > np.median(along)
     moved = np.where(above[:, None], se3.apply(se3.exp(np.array(motion), points.mean(axis=0)), points), points)
     fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (moved - points, 0.0))
-    apart, whole = (of_deformations(each)["apart"] for each in (fit, rigid))
-    np.testing.assert_array_equal(apart.changes, deformations.halves(fit)[axis])
-    assert apart.shown.log_ratio > APART > whole.shown.log_ratio + 3.0
-    assert 0.3 < apart.shown.size_mm < 4.0
+    (apart, changes), (whole, _) = (of_deformations(each)["apart"] for each in (fit, rigid))
+    np.testing.assert_array_equal(changes, deformations.halves(fit)[axis])
+    assert apart.log_ratio > APART > whole.log_ratio + 3.0
+    assert 0.3 < apart.size_mm < 4.0
 
 
 def deformed(seen, *names, whole=False):
@@ -228,7 +228,7 @@ def deformed(seen, *names, whole=False):
     }
     fit = fit_of(points, normals, noise(3000) + sum(off[name] for name in names))
     some = np.argsort(along)[:1800]
-    part = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
+    part = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.moved))
     return Fit(fit.T, fit.sigma_mm, *part, whole=fit) if whole else fit
 
 
@@ -240,20 +240,20 @@ def deformed(seen, *names, whole=False):
 def test_what_is_believed_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, names, found, whole):
     """Several may be found, and add up; the surest is named. What is below its limit is not believed."""
     fit = deformed(seen, *names, whole=whole)
-    measured, limits = of_deformations(fit.full_fit), {"strained": STRAINED, "apart": APART, "layered": LAYERED}
-    believed = {name: each for name, each in measured.items() if each.shown.log_ratio > limits[name]}
+    measured, limits = of_deformations(fit.full_fit), {"strained": 3.0, "apart": 6.0, "layered": 4.0}
+    believed = {name: each for name, each in measured.items() if each[0].log_ratio > limits[name]}
     assert set(believed) == found
     if not names:
         assert deformation(fit) is None
         return
     finding, added = deformation(fit)
-    expected = sum(covariance_added_by(fit, each.shown.size_mm * each.changes) for each in believed.values())
+    expected = sum(covariance_added_by(fit, each.size_mm * changes) for each, changes in believed.values())
     if "apart" in believed:
-        expected = expected + deformations.covariance_of_half(fit, believed["apart"].shown.size_mm)
+        expected = expected + deformations.covariance_of_half(fit, believed["apart"][0].size_mm)
     np.testing.assert_allclose(added, expected, atol=1e-12)
-    surest = max(believed, key=lambda name: believed[name].shown.log_ratio)
+    surest = max(believed, key=lambda name: believed[name][0].log_ratio)
     assert (finding.check, finding.text, finding.effect) == (surest, TEXTS[surest], Effect.WIDEN)
-    assert (finding.statistic, finding.threshold) == (believed[surest].shown.log_ratio, limits[surest])
+    assert (finding.statistic, finding.threshold) == (believed[surest][0].log_ratio, limits[surest])
 
 
 def test_either_half_lies_half_of_their_motion_from_the_pose_between_them(seen):
@@ -280,7 +280,7 @@ def test_points_without_weight_say_nothing_of_a_creep(seen):
     points, normals = seen(2400)
     order, weights = np.arange(2400) // 200, np.where(np.arange(2400) % 2, 1.0, 0.0)
     off = np.where(weights[:, None] > 0.0, 0.0, 3.0 * (order / 11.0)[:, None] * [0.0, 0.0, 1.0])
-    assert of_motion(fit_of(points, normals, noise(2400) + off, weights), order).shown.log_ratio < 1.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off, weights), order)[0].log_ratio < 1.0
 
 
 def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(seen):
@@ -289,11 +289,11 @@ def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(s
     along = points @ axis
     thick = 4.0 * (along - along.min())[:, None] / np.ptp(along) * normals
     growing, even = (
-        of_deformations(fit_of(points, normals, noise(3000) + off))["layered"] for off in (thick, 2.0 * normals)
+        of_deformations(fit_of(points, normals, noise(3000) + off))["layered"][0] for off in (thick, 2.0 * normals)
     )
-    assert growing.shown.log_ratio > LAYERED > 2.0 > even.shown.log_ratio
+    assert growing.log_ratio > LAYERED > 2.0 > even.log_ratio
     slope = 4.0 / np.ptp(along) * np.sqrt((points**2).sum(axis=1).mean())
-    assert slope / np.sqrt(3.0) < growing.shown.size_mm < 1.5 * slope  # one of three has all of it
+    assert slope / np.sqrt(3.0) < growing.size_mm < 1.5 * slope  # one of three has all of it
 
 
 def test_what_a_layer_has_everywhere_is_in_its_covariance_though_no_residual_shows_it(seen):
@@ -325,7 +325,7 @@ def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(li
     assert found.log_ratio == pytest.approx(0.0, abs=1e-6) and np.isfinite(found.size_mm)
     order = np.arange(400) // 40
     falling = replace(fit, signed_mm=fit.signed_mm + 0.4 * order)
-    moves, rests = (of_motion(each, order).shown for each in (falling, fit))
+    moves, rests = (of_motion(each, order)[0] for each in (falling, fit))
     assert moves.log_ratio > MOVES > rests.log_ratio
 
 
@@ -355,9 +355,9 @@ def test_of_a_steady_motion_its_rotation_counts_by_the_radius_of_the_points(seen
     changes = time * fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
     group = np.searchsorted([2 / 12, 4 / 12, 6 / 12, 8 / 12, 10 / 12, 11 / 12], order / 11.0, side="right")
     (same,) = shown(blocks(fit, fit.jacobian, [changes], group))
-    found = of_motion(fit, order)
-    assert found.rests_from is None and same.log_ratio > MOVES
-    assert found.shown == pytest.approx(same, rel=1e-2, abs=1e-3)
+    found, rests_from = of_motion(fit, order)
+    assert rests_from is None and same.log_ratio > MOVES
+    assert found == pytest.approx(same, rel=1e-2, abs=1e-3)
 
 
 @pytest.mark.parametrize(("first", "rests_from"), [(2, 3), (4, 5), (6, 7), (8, 9), (10, 10), (11, 11)])
@@ -366,11 +366,11 @@ def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first, rests
     points, normals, order = drawn_along(seen)
     off = np.where(order < first, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0]
     stepped, at_rest = (fit_of(points, normals, noise(2400) + each) for each in (off, 0.0 * off))
-    found, resting = (of_motion(fit, order) for fit in (stepped, at_rest))
-    assert found.shown.log_ratio > MOVES > resting.shown.log_ratio
-    assert found.rests_from == rests_from
+    (found, since), (resting, _) = (of_motion(fit, order) for fit in (stepped, at_rest))
+    assert found.log_ratio > MOVES > resting.log_ratio
+    assert since == rests_from
     later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7)
-    assert later.rests_from == rests_from + 7
+    assert later[1] == rests_from + 7
 
 
 def test_a_step_is_as_large_as_what_moved_and_may_have_been_between_any_two_groups(seen):
@@ -380,7 +380,7 @@ def test_a_step_is_as_large_as_what_moved_and_may_have_been_between_any_two_grou
     np.testing.assert_allclose(12.0 * steps, [2.0, 4.0, 6.0, 8.0, 10.0, 11.0])
     change = (order / 11.0 >= steps[1])[:, None] * motions(fit)
     (same,) = shown(blocks(fit, fit.jacobian, [change], np.searchsorted(steps, order / 11.0, "right")))
-    found = of_motion(fit, order).shown
+    found = of_motion(fit, order)[0]
     assert found.size_mm == pytest.approx(same.size_mm, rel=1e-6)
     assert found.log_ratio == pytest.approx(same.log_ratio - np.log(6.0))
 
@@ -393,34 +393,36 @@ def looks_that_err(seen, size_mm, count=2400):
     return fit_of(points, normals, noise(count) + (shifts - shifts.mean(axis=0))[look]), look
 
 
+def of_looks(fit, look):
+    """The evidence that looks err, and the changes of the residuals by it: each look moves by itself."""
+    moved, numbers = motions(fit), np.unique(look)
+    changes = np.hstack([np.where(look == number, 1.0, 0.0)[:, None] * moved for number in numbers])
+    (found,) = shown(blocks(fit, fit.jacobian, [changes], np.searchsorted(numbers, look)))
+    return found, changes
+
+
 def test_looks_that_err_against_each_other_show_by_how_much(seen):
-    sizes = [of_looks(*looks_that_err(seen, size_mm)).shown for size_mm in (0.0, 0.5, 1.5)]
-    none, some, much = sizes
+    none, some, much = (of_looks(*looks_that_err(seen, size_mm))[0] for size_mm in (0.0, 0.5, 1.5))
     assert none.log_ratio < 2.0 < some.log_ratio < much.log_ratio
     assert none.size_mm < 0.2 < 0.25 < some.size_mm < 0.8 < 0.9 < much.size_mm < 2.5
 
 
-def test_each_look_moves_by_itself(seen):
-    fit, look = looks_that_err(seen, 0.5)
-    look = np.where(look == 3, 7, look)  # a number that is missing is no look
-    found = of_looks(fit, look)
-    moved = motions(fit)
-    assert found.changes.shape == (len(look), 24)
-    for k, number in enumerate((0, 1, 2, 7)):
-        of_it = found.changes[:, 6 * k : 6 * k + 6]
-        assert np.array_equal(of_it, np.where(look == number, 1.0, 0.0)[:, None] * moved)
-    group = np.searchsorted([0, 1, 2, 7], look)
-    (same,) = shown(blocks(fit, fit.jacobian, [found.changes], group))
-    assert found.shown == same and found.limit == 0.0
-
-
-def test_what_looks_err_by_against_each_other_is_added_to_the_covariance_and_nothing_where_none_shows(seen):
-    fit, look = looks_that_err(seen, 1.5)
-    uncertainty, found = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), of_looks(fit, look)
-    added = covariance_added_by(fit, found.shown.size_mm * found.changes)
+@pytest.mark.parametrize(("size_mm", "last"), [(0.5, 3), (1.5, 3), (0.5, 7)])
+def test_what_looks_err_by_against_each_other_is_added_to_the_covariance(seen, size_mm, last):
+    """A number that is missing is no look."""
+    fit, look = looks_that_err(seen, size_mm)
+    look = np.where(look == 3, last, look)
+    (found, changes), uncertainty = of_looks(fit, look), PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0)
+    added = covariance_added_by(fit, found.size_mm * changes)
     np.testing.assert_allclose(with_looks(uncertainty, fit, look).covariance, np.eye(6) + added)
-    assert np.trace(added[:3, :3]) > 0.1
-    few = looks_that_err(seen, 1.5, 199)
-    assert of_looks(*few) is None
+    assert changes.shape == (len(look), 24) and np.trace(added[:3, :3]) > (0.1 if size_mm > 1.0 else 0.0)
+
+
+def test_nothing_is_added_of_one_look_or_few_points_or_where_the_looks_do_not_err(seen, monkeypatch):
+    fit, look = looks_that_err(seen, 1.5)
+    uncertainty, few = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), looks_that_err(seen, 1.5, 199)
     for of_one_or_few in ((fit, None), (fit, np.zeros_like(look)), few):
         assert with_looks(uncertainty, *of_one_or_few) is uncertainty
+    for log_ratio, is_same in ((0.0, True), (1e-9, False)):
+        monkeypatch.setattr(deformations, "shown", lambda _, log_ratio=log_ratio: [Shown(log_ratio, 2.0)])
+        assert (with_looks(uncertainty, fit, look) is uncertainty) is is_same

@@ -249,6 +249,8 @@ def test_poses_near_the_truth_are_brought_home_and_scored_by_their_mean_square(c
     off = np.array([se3.exp([1.0, -0.8, 0.6, 0.05, -0.04, 0.06]), se3.exp([-0.5, 0.5, -0.5, -0.03, 0.02, 0.0])])
     limits = np.array([6.0, 5.0, 4.0, 4.0, 4.0])
     poses, scores = kernels.refine_batch(off, points, np.ones(count), *view(target), limits, np.zeros(5))
+    unscored = kernels.refine_batch(off, points, np.ones(count), *view(target), limits, np.zeros(5), False)
+    assert np.allclose(unscored[0], poses, atol=1e-12) and not unscored[1].any()
     for pose in poses:
         assert np.abs(se3.apply(pose, points) - points).max() < 0.25
     expected = [np.mean([squared_distance(T, p, *view(target), 4.0) for p in points]) for T in poses]

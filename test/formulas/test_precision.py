@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from gapr_core.geometry.twists import predicted_rmse_mm
-from gapr_core.registration.uncertainty import target_error as precision
+from gapr_core.geometry.twists import bound_mm, predicted_rmse_mm
 
 
 def random_covariance(rng):
@@ -20,11 +19,11 @@ def test_the_expected_error_and_its_bound_are_those_of_drawn_poses():
     moves = twists[:, None, :3] + np.cross(twists[:, None, 3:], (points - centre)[None])
     errors = np.sqrt((moves**2).sum(axis=2).mean(axis=1))
     assert predicted_rmse_mm(covariance, points, centre) == pytest.approx(np.sqrt((errors**2).mean()), rel=0.03)
-    assert precision.bound_mm(covariance, points, centre) == pytest.approx(np.quantile(errors, 0.95), rel=0.05)
+    assert bound_mm(covariance, points, centre) == pytest.approx(np.quantile(errors, 0.95), rel=0.05)
 
 
 def test_the_bound_at_one_target_of_an_isotropic_error_is_that_of_three_degrees_of_freedom():
     covariance = np.diag([0.25] * 3 + [1e-12] * 3)
     for quantile in (0.5, 0.95):
-        bound = precision.bound_mm(covariance, np.zeros((1, 3)), np.zeros(3), quantile)
+        bound = bound_mm(covariance, np.zeros((1, 3)), np.zeros(3), quantile)
         assert bound == pytest.approx(0.5 * np.sqrt(chi2.ppf(quantile, 3)), rel=1e-6)

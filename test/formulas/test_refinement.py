@@ -113,15 +113,7 @@ def patched(means_mm, weights, sigma_mm=0.5, size=4):
     """A fit whose patches of `size` points have these residuals."""
     signed = np.repeat(means_mm, size)
     count = len(signed)
-    fit = Fit(
-        np.eye(4),
-        sigma_mm,
-        signed,
-        np.repeat(weights, size),
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros((count, 3)),
-    )
+    fit = Fit(np.eye(4), sigma_mm, signed, np.repeat(weights, size), np.zeros((count, 3)), np.zeros((count, 3)))
     neighbours = np.repeat(np.arange(count).reshape(-1, size), size, axis=0)
     return fit, neighbours
 
@@ -138,7 +130,7 @@ def test_a_patch_that_is_off_as_a_whole_loses_its_trust():
 def test_the_mean_of_a_patch_is_weighted_and_never_trusted_less_than_noise_explains():
     signed = np.array([0.2, 0.6, 0.2, 0.6, 9.0, 0.2])
     weights = np.array([1.0, 0.5, 1.0, 0.5, 0.0, 1.0])
-    fit = Fit(np.eye(4), 0.9, signed, weights, np.zeros((6, 3)), np.zeros(6), np.zeros((6, 3)))
+    fit = Fit(np.eye(4), 0.9, signed, weights, np.zeros((6, 3)), np.zeros((6, 3)))
     neighbours = np.array([[0, 1], [1, 0], [2, 3], [3, 2], [4, 5], [5, 4]])
     means = np.array([1.0 / 3.0] * 4 + [0.2] * 2)  # (0.2 + 0.3) / 1.5
     limit = CONFIG.patch_scale * max(1.4826 * np.median(means), 0.9 / np.sqrt(2.0))

@@ -16,7 +16,7 @@ def plane_fit(signed, feet, weights=None, sigma_mm=1e6):
     normals = np.tile(UP, (count, 1))
     moved = feet + signed[:, None] * normals
     weights = np.ones(count) if weights is None else weights
-    return Fit(np.eye(4), sigma_mm, signed, weights, normals, np.zeros(count, dtype=np.int64), moved)
+    return Fit(np.eye(4), sigma_mm, signed, weights, normals, moved)
 
 
 def feet_of(count=3000, seed=0):

@@ -18,7 +18,7 @@ from gapr_core.registration.scenes import free_space, look_agreement
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.free_space import Visible
 from gapr_core.registration.scenes.look_agreement import LookShares
-from gapr_core.registration.scenes.scene import MOST_PLACES, Look, Places, Scene
+from gapr_core.registration.scenes.scene import MOST_PLACES, Look, Scene
 from gapr_core.results import Effect, Finding, LookFit, Refusal, RegistrationStatus
 
 EYES = np.array([[0.0, 0.0, 300.0], [0.0, 0.0, -300.0]])
@@ -80,12 +80,10 @@ def test_where_a_point_that_is_none_was_seen_from_does_not_matter():
         scenes.split(points, places)
 
 
-def test_places_by_their_numbers_stay_apart_where_they_are_the_same():
+def test_looks_stay_apart_where_their_places_are_the_same():
     seen = [Look(np.ones((2, 3)), EYES[0]), Look(np.zeros((1, 3)), EYES[0])]
-    places = Places.of(seen)
-    assert places.viewpoints.tolist() == EYES[[0, 0]].tolist() and places.look.tolist() == [0, 0, 1]
-    again = scenes.split(np.concatenate([look.points for look in seen]), places)
-    assert [len(look.points) for look in again] == [2, 1]
+    again = scenes.split(np.concatenate([look.points for look in seen]), seen)
+    assert len(again) == 2 and all(look is given for look, given in zip(again, seen, strict=True))
 
 
 def test_a_look_of_too_few_points_is_left_out_and_where_all_are_the_first_is_refused(source):
@@ -132,8 +130,7 @@ def test_normals_of_a_scene_and_of_its_parts_point_to_the_place_of_each_point(so
     is_above = scene.source.points[:, 2] > 0.0
     assert np.array_equal(scene.look, np.where(is_above, 0, 1)) and len(scene.images) == 2
     assert [len(look.source.points) for look in scene.each] == [is_above.sum(), (~is_above).sum()]
-    assert [look.viewpoint.tolist() for look in scene.each] == EYES.tolist() and scene.names.tolist() == [0, 1]
-    assert scene.viewpoint == pytest.approx(EYES.mean(axis=0))
+    assert [look.viewpoints[0].tolist() for look in scene.each] == EYES.tolist() and scene.names.tolist() == [0, 1]
     towards = EYES[scene.look] - scene.source.points
     assert scene.source.oriented and ((scene.source.normals * towards).sum(axis=1) >= 0.0).all()
     members = np.arange(len(is_above)) % 2 == 0

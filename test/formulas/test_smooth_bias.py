@@ -16,8 +16,6 @@ from gapr_core.registration.problem import source as sources
 from gapr_core.registration.uncertainty import covariance
 from gapr_core.registration.uncertainty.linear_model import NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.uncertainty.smooth_bias import (
-    CENTRES,
-    CORRELATION_MM,
     EVIDENCE,
     FEWEST_POINTS,
     LARGEST_MOVE,
@@ -56,8 +54,8 @@ def test_each_step_is_that_of_generalised_least_squares_about_the_centroid_of_al
     found, before = corrected_fit(fit, LOOSE, source, target, CONFIG), fit.full_fit
     assert (fit.whole is not None) is (fitted < 600)
     trust = None if fit.whole is None else refinement.trust_of_whole(fit, source, CONFIG.refinement)
-    spanned, now = fields(before, CORRELATION_MM, CENTRES), before
-    equations = first = equations_of(before, CORRELATION_MM, CENTRES)
+    spanned, now = fields(before), before
+    equations = first = equations_of(before)
     for _ in range(STEPS):
         size_mm = believed_size_mm(equations)
         assert size_mm > 0.0
@@ -76,7 +74,7 @@ def test_each_step_is_that_of_generalised_least_squares_about_the_centroid_of_al
 def test_a_bias_is_believed_from_its_evidence_on(biased):
     sizes = []
     for size_mm in np.linspace(0.0, 0.4, 9):
-        equations = equations_of(biased(size_mm=size_mm)[0], CORRELATION_MM, CENTRES)
+        equations = equations_of(biased(size_mm=size_mm)[0])
         log_likelihood = equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
         expected = root_mean_square(SIZES_MM, log_likelihood) if log_likelihood.max() >= EVIDENCE else 0.0
         sizes.append(believed_size_mm(equations))

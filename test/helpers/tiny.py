@@ -59,7 +59,6 @@ def described(points, normals, shapes, variance) -> PreparedTarget:
     return PreparedTarget(
         points=points,
         normals=normals,
-        shapes=shapes,
         tree=tree,
         field=DistanceField(low, CELL_MM, nearest, steps, REACH_MM),
         anchors=np.arange(0, len(points), 4),

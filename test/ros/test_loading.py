@@ -118,7 +118,6 @@ def test_a_file_may_say_the_same_as_the_parameters_and_what_they_leave_open():
         sensor=SensorConfig("pointer", 0.0),
         covariance=CovarianceConfig(model_mm=0.1),
         num_threads=1,
-        seed=3,
     )
     same = replace(NodeParameters(), min_confidence=0.9, max_tre=0.002, sensor="pointer")
     check_file(file, same, named_in(file))

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration.checks import table
 from gapr_core.registration.checks.assessment import Assessment
@@ -51,14 +53,10 @@ def assess_fit(
     return checked_geometry(Assessment(*known, **view), config)
 
 
-def checked_geometry(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """Apply the checks of geometry; the costly ones only where the pose may still be accepted."""
-    for check in table.GEOMETRY:
-        assessment = check(assessment, config)
-    for check in table.COSTLY:
-        if assessment.reaches(config.worth_checking):
-            assessment = check(assessment, config)
-    return assessment
+def checked_geometry(a: Assessment, config: RegistrarConfig) -> Assessment:
+    """Apply the checks of geometry; the costly one only where the pose may still be accepted."""
+    a = table.equal_rival(table.unobserved_motion(a))
+    return table.flat_valley(a, config) if a.reaches(config.worth_checking) else a
 
 
 def follows_both_cortices(assessment: Assessment, config: RegistrarConfig) -> bool:
@@ -71,7 +69,7 @@ def follows_both_cortices(assessment: Assessment, config: RegistrarConfig) -> bo
     if both is None:
         return False
     sigma_mm = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement).sigma_mm
-    noise_mm = max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
+    noise_mm = max(float(np.median(assessment.source.flatness_mm)), config.refinement.smallest_sigma_mm)
     return sigma_mm < BOTH_SHARE * assessment.fit.sigma_mm and sigma_mm < BOTH_NOISE * noise_mm
 
 

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.geometry.twists import bound_mm, predicted_rmse_mm
 from gapr_core.registration.confidence.classifier import Judgement, joint
 from gapr_core.registration.fit import kernels
 from gapr_core.registration.fit.refinement import Fit
 from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.uncertainty import target_error
 from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Effect, Finding, Hypothesis, LookAnswer, Residuals
@@ -28,46 +27,26 @@ INDEPENDENT_POINTS = 30.0  # independent residuals of a source, where hypotheses
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """The best pose of a source on a target, and everything known about it.
+    """The best pose of a source on a target, and everything known about it."""
 
-    Attributes:
-        fit: the refined pose with its residuals.
-        candidates: the compared distinct poses, best first.
-        uncertainty: covariance of the pose.
-        features: measurements from which the two numbers are computed.
-        judgement: the two numbers, and the log odds that each feature adds to the first.
-        other_bone_prior: probability, before the data, that the source is of another subject's bone.
-        source, target: the registered source and its target.
-        findings: findings of the checks, in the order of the checks.
-        proposer: name of the last proposer used.
-        rounds: number of proposers used.
-        seen: the whole cloud, where `source` is only the part that the pose explains; else None.
-        members: (N,) mask of that part in `seen`; None with it.
-        viewpoint: (3,) mm, source frame: place of the camera of `seen`, the mean of several; None with it.
-        look: (N,) number of the look that each point of `source` is of; None for a single one.
-        inferred_viewpoint: (3,) mm, source frame: `viewpoint`, if it was inferred; else None.
-        factor95: bound of 95 % of the true errors, over that of the covariance.
-        looks: fit of each of several looks (`look_agreement`); else ().
-    """
-
-    fit: Fit
-    candidates: Candidates
-    uncertainty: PoseUncertainty
-    features: Mapping[str, float]
-    judgement: Judgement
-    other_bone_prior: float
+    fit: Fit  # the refined pose with its residuals
+    candidates: Candidates  # the compared distinct poses, best first
+    uncertainty: PoseUncertainty  # covariance of the pose
+    features: Mapping[str, float]  # measurements from which the two numbers are computed
+    judgement: Judgement  # the two numbers, and the log odds that each feature adds to the first
+    other_bone_prior: float  # probability, before the data, that the source is of another subject's bone
     source: PreparedSource
     target: PreparedTarget
-    findings: tuple[Finding, ...] = ()
-    proposer: str = ""
-    rounds: int = 0
-    seen: PreparedSource | None = None
-    members: NDArray[np.bool_] | None = None
-    viewpoint: Array | None = None
-    look: NDArray[np.int64] | None = None
-    inferred_viewpoint: Array | None = None
-    factor95: float = 1.0
-    looks: tuple[LookAnswer, ...] = field(default=())
+    findings: tuple[Finding, ...] = ()  # of the checks, in their order
+    proposer: str = ""  # name of the last proposer used
+    rounds: int = 0  # number of proposers used
+    seen: PreparedSource | None = None  # the whole cloud, where `source` is only the part that the pose explains
+    members: NDArray[np.bool_] | None = None  # (N,) mask of that part in `seen`; None with it
+    viewpoint: Array | None = None  # (3,) mm, source frame: place of the camera of `seen`, the mean of several
+    look: NDArray[np.int64] | None = None  # (N,) number of the look that each point of `source` is of; None for one
+    inferred_viewpoint: Array | None = None  # (3,) mm, source frame: `viewpoint`, if it was inferred
+    factor95: float = 1.0  # bound of 95 % of the true errors, over that of the covariance
+    looks: tuple[LookAnswer, ...] = field(default=())  # fit of each of several looks (`look_agreement`)
 
     @property
     def confidence(self) -> float:
@@ -96,7 +75,7 @@ class Assessment:
 
     def bound_mm(self, points: Array) -> float:
         """Bound the error over points (M, 3) of the target frame at 95 %, mm; one point for one named target."""
-        return self.factor95 * target_error.bound_mm(self.uncertainty.covariance, points, self.centre_mm)
+        return self.factor95 * bound_mm(self.uncertainty.covariance, points, self.centre_mm)
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -110,14 +89,14 @@ class Assessment:
         if self.seen is None or self.members is None:
             fit = self.fit.full_fit
             points = self.source.points if fit is self.fit else self.source.whole
-            exact = self.target.mesh_distances(se3.apply(fit.T, points))
-            return Residuals(points, exact[0] if exact else fit.signed_mm, fit.counts)
-        exact = self.target.mesh_distances(se3.apply(self.fit.T, self.seen.points))
-        on_elements = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
-        distance_mm = exact[0] if exact else on_elements
-        counts = np.zeros(len(self.members), dtype=bool)
-        counts[self.members] = self.fit.counts
-        return Residuals(self.seen.points, distance_mm, counts)
+            on_elements, counts = fit.signed_mm, fit.counts
+        else:
+            fit, points = self.fit, self.seen.points
+            on_elements = kernels.residuals_at(fit.T, points, *self.target.kernel_view, 0.0)[0]
+            counts = np.zeros(len(self.members), dtype=bool)
+            counts[self.members] = fit.counts
+        exact = self.target.mesh_distances(se3.apply(fit.T, points))
+        return Residuals(points, exact[0] if exact else on_elements, counts)
 
     def reaches(self, limit: float) -> bool:
         """Return True when no finding refuses the pose and its confidence reaches `limit`."""
@@ -138,7 +117,7 @@ class Assessment:
         return replace(self, uncertainty=replace(self.uncertainty, covariance=covariance), factor95=factor95)
 
 
-def shared_probability(best: float, scores: Array, independent_points: float = INDEPENDENT_POINTS) -> tuple[float, ...]:
+def shared_probability(best: float, scores: Array) -> tuple[float, ...]:
     """Share the remainder of the best hypothesis's probability among its rivals, by their likelihoods.
 
     A rival's likelihood relative to the best is exp(-n / 2 (s / s_best - 1)): that of n independent residuals whose
@@ -147,8 +126,7 @@ def shared_probability(best: float, scores: Array, independent_points: float = I
     Args:
         best: probability of the best, 0 to 1.
         scores: (K,) mean squares s of the residuals, mm^2, best first.
-        independent_points: n, 0 or more.
     """
-    likelihood = np.exp(-0.5 * independent_points * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))
+    likelihood = np.exp(-0.5 * INDEPENDENT_POINTS * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))
     share = min(best, (1.0 - best) / max(float(likelihood.sum()), 1e-12))
     return (best, *(share * likelihood))

@@ -17,7 +17,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import extent
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.table import refuse
-from gapr_core.registration.confidence import feature_labels
+from gapr_core.registration.confidence import features
 from gapr_core.registration.fit import alternatives
 from gapr_core.results import Effect, Finding, RegistrationResult, RegistrationStatus, confidence_text
 from gapr_core.surface import Surface
@@ -38,7 +38,7 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
         clutter: name of the refusal where most of the cloud is not this bone.
     """
     a, tre95_mm, judged = assessment, assessment.tre95_mm, assessment.judgement
-    against = feature_labels.against(judged.contributions)
+    against = features.against(judged.contributions)
     refusal = a.refusal or by_threshold(a.confidence, judged.pose_probability, tre95_mm, config, against)
     if refusal is not None and clutter is not None:
         refusal = replace(clutter, text=f"{clutter.text}; {refusal.text}")

@@ -15,8 +15,8 @@ from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.table import MIRRORED_BETTER
 from gapr_core.registration.fit import alternatives
 from gapr_core.registration.fit.alternatives import flipped
-from gapr_core.registration.fit.refinement import evaluate
-from gapr_core.registration.fit.verification import Candidates, mean_square_mm2
+from gapr_core.registration.fit.refinement import evaluate, refine_many
+from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
@@ -71,7 +71,8 @@ def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config:
     """Take the larger log ratio, of mean squares or robust variances: gross points may lie on an image by chance."""
     own = float(a.candidates.scores[0])
     if a.seen is not None:  # a scene's own scores are no mean squares
-        own = mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+        limits_mm = np.linspace(*config.verification.final_limits_mm)
+        own = float(refine_many(a.fit.T[None], a.source.points, a.target, limits_mm, config.num_threads)[1][0])
     sigma_mm = evaluate(image.poses[0], mirrored.points, a.target, config.refinement).sigma_mm
     return max(
         alternatives.log_ratio(float(image.scores[0]), own),

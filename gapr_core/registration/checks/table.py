@@ -1,4 +1,4 @@
-"""Table of the checks of a pose: each compares a statistic with its threshold, and may give a finding.
+"""Checks of a pose: each compares a statistic with its threshold, and may give a finding.
 
 A check refuses only where no probability can decide: a motion that is not observed, a rival that is as good, a mirror
 image. Anything learnable is a feature of the classifier. `docs/concepts/checks.md` has a row for each check.
@@ -6,30 +6,29 @@ image. Anything learnable is a feature of the classifier. `docs/concepts/checks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.deformation import deformation
 from gapr_core.registration.fit import alternatives
 from gapr_core.results import Effect, Finding, RegistrationStatus
 
-Check = Callable[[Assessment, RegistrarConfig], Assessment]
-
+DEGENERATE, AMBIGUOUS = RegistrationStatus.DEGENERATE, RegistrationStatus.AMBIGUOUS
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations of a motion that is not observed
 EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # mean square of a rival as good over the best's, less 1; the same as a length
 MIRRORED_BETTER = 0.01  # log of mean squares by which the mirror image may fit better
 MORE_BONE = "measure another side or an end of the bone"
 
 
-def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
+def unobserved_motion(a: Assessment) -> Assessment:
     """Refuse a pose with a motion that the points do not determine: a spin about a shaft, a slide along it."""
     turn_deg, shift_mm = a.uncertainty.largest_turn_deg, a.uncertainty.largest_shift_mm
     turns, slides = turn_deg > LARGEST_TURN_DEG, shift_mm > LARGEST_SHIFT_MM
-    text = f"the bone could still be {' and '.join([turn_text(a)] * turns + [shift_text(a)] * slides)}"
+    turned = _open("turned about", a.uncertainty.weakest_turn, turn_deg, 180.0, "degrees", a)
+    shifted = _open("shifted along", a.uncertainty.weakest_shift, shift_mm, 1000.0, "mm", a)
+    text = f"the bone could still be {' and '.join([turned] * turns + [shifted] * slides)}"
     if turns:
         return a.with_finding(refuse("unobserved turn", turn_deg, LARGEST_TURN_DEG, DEGENERATE, text))
     if slides:
@@ -37,7 +36,7 @@ def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
     return a
 
 
-def equal_rival(a: Assessment, config: RegistrarConfig) -> Assessment:
+def equal_rival(a: Assessment) -> Assessment:
     """Refuse a pose where a distinct one explains the source as well."""
     scores = a.candidates.scores
     if len(scores) < 2 or not scores[1] < as_good_as(scores[0]):
@@ -76,38 +75,10 @@ def mirror_image(a: Assessment, log_ratio: float) -> Assessment:
     return a.with_finding(finding)
 
 
-def one_rigid_piece(a: Assessment, config: RegistrarConfig) -> Assessment:
-    """Widen the covariance of a source that is strained, in two halves, or under a layer that grows."""
-    found = deformation(a.fit)
-    return a if found is None else a.with_finding(*found)
-
-
-def turn_text(a: Assessment) -> str:
-    """Describe the largest turn that the points leave open, about an axis of the bone."""
-    turn_deg = a.uncertainty.largest_turn_deg
-    axis = axis_name(a.uncertainty.weakest_turn, a)
-    how = f"by {turn_deg:.0f} degrees" if turn_deg <= 180.0 else "freely"
-    return f"turned about {axis} {how}"
-
-
-def shift_text(a: Assessment) -> str:
-    """Describe the largest shift that the points leave open, along an axis of the bone."""
-    shift_mm = a.uncertainty.largest_shift_mm
-    axis = axis_name(a.uncertainty.weakest_shift, a)
-    how = f"by {shift_mm:.0f} mm" if shift_mm <= 1000.0 else "freely"
-    return f"shifted along {axis} {how}"
-
-
-def axis_name(direction: np.ndarray, a: Assessment) -> str:
-    """Name a direction (3,) of the target frame by the nearest main axis of the bone."""
-    along = np.abs(a.target.main_axes @ direction)
-    return ("its long axis", "its middle axis", "its short axis")[int(np.argmax(along))]
-
-
-DEGENERATE, AMBIGUOUS = RegistrationStatus.DEGENERATE, RegistrationStatus.AMBIGUOUS
-GEOMETRY: tuple[Check, ...] = (unobserved_motion, equal_rival)  # checks of every pose
-COSTLY: tuple[Check, ...] = (flat_valley,)  # checks of a pose that may be accepted
-WIDENING: tuple[Check, ...] = (one_rigid_piece,)  # checks of an accepted pose
+def _open(how: str, axis: NDArray[np.float64], size: float, most: float, unit: str, a: Assessment) -> str:
+    """Describe an open motion about or along the main axis of the bone that is nearest to an axis (3,)."""
+    named = ("its long axis", "its middle axis", "its short axis")[int(np.abs(a.target.main_axes @ axis).argmax())]
+    return f"{how} {named} " + (f"by {size:.0f} {unit}" if size <= most else "freely")
 
 
 def refuse(

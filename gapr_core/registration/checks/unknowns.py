@@ -18,28 +18,22 @@ from scipy.spatial import cKDTree
 from gapr_core.geometry import extent, sampling
 from gapr_core.geometry.twists import distance_jacobian
 from gapr_core.registration.fit.refinement import Fit
-from gapr_core.registration.uncertainty.linear_model import smooth_correlation
+from gapr_core.registration.uncertainty.linear_model import CORRELATION_MM, smooth_correlation
 
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 200  # least inliers for a test
 CELLS = 40  # number of cells of the averages
-CORRELATION_MM = 20.0  # l of a smooth bias's correlation exp(-d^2 / 2 l^2)
 BIASES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4])  # candidate sizes of the smooth bias
 SHARED_MM = np.array([0.05, 0.2, 0.5, 1.0])  # candidate sizes of the shared error of a block
 SIZES_MM = np.array([0.0, 0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0, 12.0])  # candidate sizes of the further unknowns
 
 
 class Shown(NamedTuple):
-    """Evidence of the residuals for further unknowns.
+    """Evidence of the residuals for further unknowns."""
 
-    Attributes:
-        log_ratio: log likelihood of their best size over that of none; 0 where none is best.
-        size_mm: posterior root mean square of the size of each; all `SIZES_MM` are equally likely before.
-    """
-
-    log_ratio: float
-    size_mm: float
+    log_ratio: float  # log likelihood of their best size over that of none; 0 where none is best
+    size_mm: float  # posterior root mean square of the size of each; all `SIZES_MM` are equally likely before
 
 
 NOTHING = Shown(0.0, 0.0)
@@ -47,21 +41,13 @@ NOTHING = Shown(0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Averages over blocks of neighbouring inliers.
+    """Averages over blocks of neighbouring inliers."""
 
-    Attributes:
-        residuals: (n,) mm.
-        free: (n, j) derivatives by the nuisance unknowns: a motion of the source, at least.
-        more: (n, m, k) derivatives by the further unknowns, of 1 mm each: m alternatives of k at most, others 0.
-        variances: (n,) variances by the noise of the points, mm^2.
-        feet: (n, 3) mean foot points, mm.
-    """
-
-    residuals: Array
-    free: Array
-    more: Array
-    variances: Array
-    feet: Array
+    residuals: Array  # (n,) mm
+    free: Array  # (n, j) derivatives by the nuisance unknowns: a motion of the source, at least
+    more: Array  # (n, m, k) derivatives by the further unknowns, of 1 mm each: m alternatives of k at most, others 0
+    variances: Array  # (n,) variances by the noise of the points, mm^2
+    feet: Array  # (n, 3) mean foot points, mm
 
 
 def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -> Blocks:
@@ -100,16 +86,13 @@ def shown(found: Blocks) -> list[Shown]:
     noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, CORRELATION_MM)
     shared = SHARED_MM[:, None, None] ** 2 * np.eye(len(noise))
     V = np.concatenate([noise + bias_mm**2 * correlation + shared for bias_mm in BIASES_MM])
-    of_all = _log_likelihoods(found, V)
-    return [_of_sizes(of_all[:, i]) for i in range(of_all.shape[1])]
-
-
-def _of_sizes(log_likelihood: Array) -> Shown:
-    """Compute the evidence from (errors, K) log likelihoods of each of `SIZES_MM`."""
-    best = log_likelihood.max(axis=0)
-    posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
-    size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
-    return Shown(float(best.max() - best[0]), size_mm)
+    evidence = []
+    for log_likelihood in _log_likelihoods(found, V).swapaxes(0, 1):
+        best = log_likelihood.max(axis=0)
+        posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
+        size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
+        evidence.append(Shown(float(best.max() - best[0]), size_mm))
+    return evidence
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:

@@ -25,17 +25,11 @@ FIT_AGAIN = "fit it again: python -m gapr_core.calibration --anatomy DIR --out D
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The contribution of one feature: linear between the knots, constant beyond the first and the last.
+    """The contribution of one feature: linear between the knots, constant beyond the first and the last."""
 
-    Attributes:
-        feature: its name.
-        knots: (K,) values of the feature, ascending.
-        adds: (K,) contributions at the knots.
-    """
-
-    feature: str
-    knots: Array
-    adds: Array
+    feature: str  # its name
+    knots: Array  # (K,) values of the feature, ascending
+    adds: Array  # (K,) contributions at the knots
 
     def at(self, values: Any) -> Array:
         """Evaluate the contribution at any values (...) of the feature."""
@@ -90,28 +84,20 @@ def from_dict(data: Mapping[str, Any]) -> Additive:
     return Additive(constant, curves)
 
 
-def read(path: Path, kind: str) -> dict[str, Any]:
-    """Read the content of a model's JSON file of a kind, for example "confidence".
+def load(path: str | Path, kind: str, build: Callable[[dict[str, Any]], Model]) -> Model:
+    """Read a model's JSON file of a kind, for example "confidence", and build the model.
 
     Raises:
         WeightsError: no such file, a damaged one, or one of another format or kind.
     """
+    path = Path(path)
     if not path.is_file():
         raise WeightsError(f"a {kind} model", f"no file {path}", "reinstall the package, or " + FIT_AGAIN)
     try:
         data = json.loads(path.read_text())
         given = data.get("format", 1), data.get("kind", kind)
-    except (ValueError, AttributeError) as error:
-        raise WeightsError(f"a whole {kind} model", f"{path}: {error!r}", FIT_AGAIN) from error
-    if given != (FORMAT, kind):
-        raise WeightsError(f"a {kind} model of format {FORMAT}", f"{path}: {given[1]} of {given[0]}", FIT_AGAIN)
-    return dict(data)
-
-
-def load(path: str | Path, kind: str, build: Callable[[dict[str, Any]], Model]) -> Model:
-    """Read a model's file and build the model; raises WeightsError, as `read`, where the content is damaged."""
-    data = read(Path(path), kind)
-    try:
-        return build(data)
+        if given == (FORMAT, kind):
+            return build(data)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WeightsError(f"a whole {kind} model", f"{path}: {error!r}", FIT_AGAIN) from error
+    raise WeightsError(f"a {kind} model of format {FORMAT}", f"{path}: {given[1]} of {given[0]}", FIT_AGAIN)

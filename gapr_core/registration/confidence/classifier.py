@@ -27,16 +27,11 @@ LARGEST_EVIDENCE = 3.0  # log10: the pairs of subjects cannot show look-alikes r
 
 @dataclass(frozen=True)
 class Judgement:
-    """The two numbers of an answer.
+    """The two numbers of an answer."""
 
-    Attributes:
-        pose_log_odds: log odds that the pose is within 4 mm and 5 deg, given that this is the right bone.
-        bone_evidence: log10 likelihood ratio of this bone to another subject's.
-        contributions: log odds that each feature adds to those of the pose, compared with the usual answer.
-    """
-
-    pose_log_odds: float
-    bone_evidence: float
+    pose_log_odds: float  # that the pose is within 4 mm and 5 deg, given that this is the right bone
+    bone_evidence: float  # log10 likelihood ratio of this bone to another subject's
+    # log odds that each feature adds to those of the pose, compared with the usual answer
     contributions: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -59,20 +54,13 @@ def bone_probability(evidence: float, other_bone_prior: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Classifier:
-    """Models of both numbers, for sources that are bone alone and for a camera's clouds.
+    """Models of both numbers, for sources that are bone alone and for a camera's clouds."""
 
-    Attributes:
-        pose: model of the pose's log odds, by kind (`features.FEATURES_OF`).
-        bone: model of the natural log likelihood ratio of this bone, by kind.
-        rho_pose, rho_bone: correlation of two frames of a stream, of each number (`streams.evidence`).
-        card: data and fit.
-    """
-
-    pose: Mapping[str, Additive]
-    bone: Mapping[str, Additive]
-    rho_pose: float = 0.8
+    pose: Mapping[str, Additive]  # model of the pose's log odds, by kind (`features.FEATURES_OF`)
+    bone: Mapping[str, Additive]  # model of the natural log likelihood ratio of this bone, by kind
+    rho_pose: float = 0.8  # correlation of two frames of a stream, of each number (`streams.evidence`)
     rho_bone: float = 0.8
-    card: Mapping[str, object] = field(default_factory=dict)
+    card: Mapping[str, object] = field(default_factory=dict)  # data and fit
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> Classifier:

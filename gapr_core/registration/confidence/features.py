@@ -1,4 +1,4 @@
-"""Features of a refined pose among its rivals, from which the two numbers are computed."""
+"""Features of a refined pose among its rivals, from which the two numbers are computed, and their labels."""
 
 from __future__ import annotations
 
@@ -17,13 +17,7 @@ from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import sensor
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.uncertainty.covariance import (
-    CENTRES,
-    CORRELATION_MM,
-    SIZES_MM,
-    SMALLEST_SHARE,
-    PoseUncertainty,
-)
+from gapr_core.registration.uncertainty.covariance import SIZES_MM, SMALLEST_SHARE, PoseUncertainty
 from gapr_core.registration.uncertainty.linear_model import equations_of, fields, root_mean_square
 
 Array = NDArray[np.float64]
@@ -45,6 +39,35 @@ SIGNS = {
     "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "log_hypotheses": 1, "free_space_score": 1,
     "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: larger values can only raise the probability, -1: only lower it
+FEATURE_LABELS = {
+    "log_sigma": "size of the residuals",
+    "log_excess": "residuals against the noise of the source",
+    "smooth_misfit": "smooth misfit to the bone, long range",
+    "short_misfit": "smooth misfit to the bone, short range",
+    "inlier_ratio": "share of the points that fit",
+    "residual": "residual of the best hypothesis before refinement",
+    "margin": "lead over the next hypothesis",
+    "log_hypotheses": "number of hypotheses that competed",
+    "support": "share of the attempts that ended here",
+    "log_shift_sd": "uncertainty of the position",
+    "log_turn_sd": "uncertainty of the rotation",
+    "normal_agreement": "agreement of the normals",
+    "log_points": "number of points",
+    "extent": "size of the source against the bone",
+    "scale_z": "evidence that another size fits better",
+    "scale_off": "size with which the source fits best",
+    "log_scale_sd": "uncertainty of the size that fits best",
+    "size_margin": "fit of a source of another size",
+    "near_size_margin": "fit of a source grown or shrunk a little",
+    "mirror_margin": "fit of the mirrored source",
+    "rough_misfit": "misfit that may change within centimetres",
+    "free_space_score": "score against the camera's lines of sight",
+    "log_explained_mm2": "measured surface that the bone explains",
+    "explained_of_compared": "share of the compared surface that is explained",
+    "violating_of_compared": "share of the compared surface that the camera looked through",
+    "rival_margin": "lead over the next hypothesis of the scene",
+}  # in plain words
+MOST_NAMED, WORTH_NAMING = 2, -0.5  # features named against an answer, and the most log odds of one
 NEAR_SIZES = (0.9725, 1.0275)  # halfway: a source of this size fits in size 1 as well as in `SIZES`
 FEWEST_FOR_SIZE = 8  # least inliers for an estimate of the size
 WIDEST, STANDOFF_MM = 0.3, 0.5  # prior standard deviations of the relative size, and of a stand-off
@@ -76,7 +99,7 @@ def measure(
     """
     inlier, kind = fit.counts, BONE if of_view is None else SCENE
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
-    noise_mm = max(noise_of(source.flatness_mm, source, fit), LEAST_NOISE_MM)
+    noise_mm = max(noise_of(source, fit), LEAST_NOISE_MM)
     values = {
         "log_sigma": float(np.log(fit.sigma_mm)),
         "log_excess": float(np.log(fit.sigma_mm / noise_mm)),
@@ -106,13 +129,13 @@ def of_bone_alone(fit: Fit, candidates: Candidates) -> dict[str, float]:
     }
 
 
-def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
+def noise_of(source: PreparedSource, fit: Fit) -> float:
     """Estimate the noise of a point, mm, from its neighbours: the upper end of its likely range.
 
     Noise and the curvature of the bone take neighbours off their plane; their foot points show the curvature alone.
     """
     curved_mm = fit_planes(fit.full_fit.feet, source.patches)[1]
-    left_mm2 = flatness_mm**2 - curved_mm**2
+    left_mm2 = source.flatness_mm**2 - curved_mm**2
     middle_mm2 = float(np.median(left_mm2))
     spread_mm2 = SD_OF_MEDIAN * float(np.median(np.abs(left_mm2 - middle_mm2)))
     patches = max(len(fit.full_fit.feet) / source.patches.shape[1], 1.0)
@@ -149,9 +172,14 @@ def scale_of(fit: Fit) -> tuple[float, float]:
         return 0.0, 1.0
     growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # feet: points carry noise
     more = np.column_stack([growth, np.ones_like(growth)])
-    bias = CORRELATION_MM, CENTRES
-    equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (WIDEST, STANDOFF_MM))
+    equations = equations_of(fit).extended(fit, fields(fit), more, (WIDEST, STANDOFF_MM))
     size_mm = root_mean_square(SIZES_MM, equations.log_likelihood(SIZES_MM, SMALLEST_SHARE))
     variance = equations.step_covariance(size_mm)[6, 6]
     scale = float(equations.step(size_mm)[6])
     return float(np.clip(scale, -1.0, 1.0)), float(np.clip(np.sqrt(max(variance, 0.0)), 1e-5, 1.0))
+
+
+def against(contributions: Mapping[str, float]) -> str:
+    """Name the features with the most negative log odds; "" where none is below `WORTH_NAMING`."""
+    named = sorted((adds, name) for name, adds in contributions.items() if adds <= WORTH_NAMING)[:MOST_NAMED]
+    return ", ".join(FEATURE_LABELS.get(name, name) for _, name in named)

@@ -36,17 +36,10 @@ FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A pose and the few points on which changes of it are tried.
+    """A pose and the few points on which changes of it are tried."""
 
-    Attributes:
-        T: (4, 4) T_target_source, mm.
-        points: (N, 3) mm, source frame.
-        target: the bone.
-        config: settings of refinement and verification.
-    """
-
-    T: Array
-    points: Array
+    T: Array  # (4, 4) T_target_source, mm
+    points: Array  # (N, 3) mm, source frame
     target: PreparedTarget
     config: RegistrarConfig
 
@@ -62,10 +55,6 @@ class Trial:
     def own_mm2(self) -> float:
         """Mean square of the source's own pose, mm^2."""
         return float(self.refined(self.T[None])[1][0])
-
-    def log_ratio(self, changed_mm2: float) -> float:
-        """Compute the log of a mean square, mm^2, over that of the own pose."""
-        return log_ratio(changed_mm2, self.own_mm2)
 
 
 @lru_cache(maxsize=1)  # features and checks of one fit share it
@@ -87,7 +76,7 @@ def other_size(trial: Trial, sizes: Sequence[float] = SIZES) -> float:
     some = trial.points
     centre = some.mean(axis=0)
     changed = [trial.refined(trial.T[None], centre + s * (some - centre))[1][0] / s**2 for s in sizes]
-    return trial.log_ratio(min(changed))
+    return log_ratio(min(changed), trial.own_mm2)
 
 
 def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tuple[float, float]:
@@ -99,7 +88,7 @@ def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tupl
 
     changed = {mm: misfit_mm2(mm) for mm in standoffs_mm}
     best_mm = min(changed, key=changed.__getitem__)
-    return best_mm, trial.log_ratio(changed[best_mm])
+    return best_mm, log_ratio(changed[best_mm], trial.own_mm2)
 
 
 def pushed(trial: Trial, fit: Fit) -> float:
@@ -138,7 +127,7 @@ def mirrored(trial: Trial) -> float:
     poses, scores = trial.refined(reflections @ trial.T @ FLIP, flipped(trial.points))
     for number in np.argsort(scores):
         if not _is_own_image(poses[number] @ FLIP @ se3.inverse(trial.T), trial.target):
-            return trial.log_ratio(scores[number])
+            return log_ratio(scores[number], trial.own_mm2)
     return CLIPPED[1]
 
 
@@ -147,38 +136,38 @@ def on_own_image(trial: Trial) -> float:
 
     The larger of the ratios of mean squares and of robust variances: a few gross points may fit an image by chance.
     """
-    image = _kept_image(trial)
+    image, _ = _own_image(trial)
     if image is None:
         return CLIPPED[1]
     poses, scores = trial.refined((image @ trial.T @ FLIP)[None], flipped(trial.points))
     refinement = trial.config.refinement
     changed = evaluate(poses[0], flipped(trial.points), trial.target, refinement).sigma_mm
     own = evaluate(trial.T, trial.points, trial.target, refinement).sigma_mm
-    return max(trial.log_ratio(scores[0]), log_ratio(changed**2, own**2))
+    return max(log_ratio(scores[0], trial.own_mm2), log_ratio(changed**2, own**2))
 
 
 def is_symmetric(trial: Trial) -> bool:
     """Return True for a model whose halves are mirror images of each other: a flipped source of it is no mistake."""
-    target, image = trial.target, _kept_image(trial)
-    key = "symmetric", target.offset_mm, trial.config.verification
-    if image is None:
-        return False
-    if key not in target.cache:
-        points = flipped(_some_of(target))
-        T = trial.refined((image @ FLIP)[None], points)[0][0]
-        target.cache[key] = bool(np.median(distances_mm(T, points, target)) < SYMMETRIC_MM)
-    return bool(target.cache[key])
+    return _own_image(trial)[1]
 
 
-def _kept_image(trial: Trial) -> Array | None:
-    """Find the (4, 4) motion with a reflection that lays the bone on itself, once per target; None without one."""
+def _own_image(trial: Trial) -> tuple[Array | None, bool]:
+    """Find the (4, 4) motion with a reflection that lays the bone on itself, None without one; once per target.
+
+    Its flag is True where the halves of the bone are mirror images of each other.
+    """
     target = trial.target
     key = "own image", target.offset_mm, trial.config.verification  # targets share their cache with other stand-offs
     if key not in target.cache:
+        points = flipped(_some_of(target))
         planes = np.array([_reflection(normal, target.centre_mm) for normal in target.main_axes])
-        poses, scores = trial.refined(planes @ FLIP, flipped(_some_of(target)))
+        poses, scores = trial.refined(planes @ FLIP, points)
         images = [poses[number] @ FLIP for number in np.argsort(scores)]
-        target.cache[key] = next((image for image in images if _is_own_image(image, target)), None)
+        image, off_mm = next((image for image in images if _is_own_image(image, target)), None), np.inf
+        if image is not None:
+            T = trial.refined((image @ FLIP)[None], points)[0][0]
+            off_mm = float(np.median(distances_mm(T, points, target)))
+        target.cache[key] = image, bool(off_mm < SYMMETRIC_MM)
     return target.cache[key]  # type: ignore[no-any-return]
 
 

@@ -22,14 +22,14 @@ TURN_DAMPING_MM2 = 1.0  # added to that of a turn
 
 
 @numba.njit(**FAST)
-def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spacing, limits, variances):
+def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spacing, limits, variances, scored=True):
     """Iterate Gauss-Newton from every pose (K, 4, 4), once per entry of `limits` (Tukey scale) and `variances`.
 
     `trust` (N,) are weights of the points, on top of Tukey's. With a variance of the noise, a residual also weighs as
     much as the noise's share in its variance; the rest is the element's. Returns the poses and their mean squared
-    distances, truncated at the last limit.
+    distances, truncated at the last limit; zeros unless `scored`.
     """
-    out, scores = poses.copy(), np.empty(len(poses))
+    out, scores = poses.copy(), np.zeros(len(poses))
     surface = elements, nearest, origin, per_cell, spacing
     H, g = np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
@@ -38,7 +38,8 @@ def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spac
         for i in range(len(limits)):
             accumulate(T, points, trust, middle, *surface, limits[i], variances[i], H, g)
             step(T, middle, H, g, len(points))
-        scores[k] = mean_square(T, points, trust, *surface, limits[-1])
+        if scored:
+            scores[k] = mean_square(T, points, trust, *surface, limits[-1])
     return out, scores
 
 

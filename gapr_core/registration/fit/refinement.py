@@ -32,29 +32,16 @@ PATCH_POINTS = SourceConfig().normal_neighbours  # of an unprepared source
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose and the residuals of the source on the target under it.
+    """A pose and the residuals of the source on the target under it."""
 
-    Attributes:
-        T: (4, 4) T_target_source, mm.
-        sigma_mm: robust standard deviation of the residuals.
-        signed_mm: (N,) signed distances to the surface, NaN where none is near.
-        weights: (N,) weights of the points in the normal equations, 0 for outliers.
-        gradients: (N, 3) unit surface normals at the foot points, target frame.
-        elements: (N,) indices of the nearest target points, -1 where none is near.
-        moved: (N, 3) source points in the target frame.
-        bias_mm: standard deviation of the smooth bias that the pose is corrected for; 0 for plain least squares.
-        whole: the same pose with all points of the source; None where all are here.
-    """
-
-    T: Array
-    sigma_mm: float
-    signed_mm: Array
-    weights: Array
-    gradients: Array
-    elements: NDArray[np.int64]
-    moved: Array
-    bias_mm: float = 0.0
-    whole: Fit | None = None
+    T: Array  # (4, 4) T_target_source, mm
+    sigma_mm: float  # robust standard deviation of the residuals
+    signed_mm: Array  # (N,) signed distances to the surface, NaN where none is near
+    weights: Array  # (N,) weights of the points in the normal equations, 0 for outliers
+    gradients: Array  # (N, 3) unit surface normals at the foot points, target frame
+    moved: Array  # (N, 3) source points in the target frame
+    bias_mm: float = 0.0  # standard deviation of the smooth bias that the pose is corrected for; 0: least squares
+    whole: Fit | None = None  # the same pose with all points of the source; None where all are here
 
     @property
     def full_fit(self) -> Fit:
@@ -95,7 +82,7 @@ def refine_many(
     variances, trust = np.zeros_like(limits_mm), np.ones(len(points))
 
     def work(piece: Array) -> tuple[Array, Array]:
-        return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
+        return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances, True)
 
     is_little = len(poses) * len(points) * len(limits_mm) < WORTH_A_THREAD
     pieces = in_pieces(work, np.ascontiguousarray(poses), 1 if is_little else num_threads)
@@ -126,7 +113,7 @@ def refine_fully(
         trust = patch_trust(fit, neighbours, config) if number >= config.free_rounds else np.ones(len(points))
         limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
         variances = np.full_like(limits, fit.sigma_mm**2)
-        poses, _ = kernels.refine_batch(fit.T[None], points, trust, *target.kernel_view, limits, variances)
+        poses, _ = kernels.refine_batch(fit.T[None], points, trust, *target.kernel_view, limits, variances, False)
         step = se3.apply(poses[0], points) - fit.moved
         fit = evaluate(poses[0], points, target, config)
         if number >= config.free_rounds and np.abs(step).max() < config.rest_mm:
@@ -140,7 +127,7 @@ def rest_on_whole(fit: Fit, source: PreparedSource, target: PreparedTarget, conf
         return fit
     limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
     variances, trust = np.full_like(limits, fit.sigma_mm**2), trust_of_whole(fit, source, config)
-    poses, _ = kernels.refine_batch(fit.T[None], source.whole, trust, *target.kernel_view, limits, variances)
+    poses, _ = kernels.refine_batch(fit.T[None], source.whole, trust, *target.kernel_view, limits, variances, False)
     some = evaluate_with_patches(poses[0], source.points, target, config, source.neighbours)
     return replace(some, whole=evaluate_trusted(poses[0], source.whole, target, config, trust))
 
@@ -168,7 +155,7 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     weights = np.maximum(1.0 - (signed * signed + aside * aside) / (limit_mm * limit_mm), 0.0) ** 2
     weights *= sigma_mm**2 / (sigma_mm**2 + target.elements[elements, -1])
     weights[elements < 0] = 0.0
-    return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+    return Fit(T, sigma_mm, signed, weights, gradients, se3.apply(T, points))
 
 
 def evaluate_trusted(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, trust: Array) -> Fit:

@@ -18,20 +18,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Distinct poses that explain the source, best first.
+    """Distinct poses that explain the source, best first."""
 
-    Attributes:
-        poses: (K, 4, 4) T_target_source, mm.
-        scores: (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's
-            cloud 1 / the score of lines of sight (`clutter.small_is_good`).
-        support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
-        hypotheses: number of hypotheses that competed.
-    """
-
-    poses: Array
+    poses: Array  # (K, 4, 4) T_target_source, mm
+    # (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's cloud 1 / the
+    # score of lines of sight
     scores: Array
-    support: Array
-    hypotheses: int = 1
+    support: Array  # (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose
+    hypotheses: int = 1  # number of those that competed
 
 
 def verify(
@@ -57,14 +51,6 @@ def verify(
     poses, scores = _distinct(poses, scores, source, config, config.final_poses)
     shares = support(poses, crowd, source, config.markers, config.same_pose_mm)
     return Candidates(poses, scores, shares, count)
-
-
-def mean_square_mm2(
-    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
-) -> float:
-    """Score a pose (4, 4) as `verify` does, mm^2."""
-    scores = refine_many(T[None], source.points, target, np.linspace(*config.final_limits_mm), num_threads)[1]
-    return float(scores[0])
 
 
 def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:

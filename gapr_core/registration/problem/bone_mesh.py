@@ -21,21 +21,13 @@ ON_BORDER = 1e-6  # barycentric coordinate: the nearest point lies on an edge or
 
 @dataclass(frozen=True, eq=False)
 class BoneMesh:
-    """Triangles with outward normals.
+    """Triangles with outward normals."""
 
-    Attributes:
-        vertices: (N, 3) mm.
-        faces: (F, 3) indices into the vertices.
-        normals: (F, 3) unit, outward.
-        at_vertices: (N, 3) sums of the normals around, by area.
-        tree: libigl's tree over the faces.
-    """
-
-    vertices: Array
-    faces: Faces
-    normals: Array
-    at_vertices: Array
-    tree: Any
+    vertices: Array  # (N, 3) mm
+    faces: Faces  # (F, 3) indices into the vertices
+    normals: Array  # (F, 3) unit, outward
+    at_vertices: Array  # (N, 3) sums of the normals around, by area
+    tree: Any  # libigl's tree over the faces
 
     def distances(self, points: Array) -> tuple[Array, Array]:
         """Measure signed distances (K,) of points (K, 3), mm, positive outside, and their gradients (K, 3)."""

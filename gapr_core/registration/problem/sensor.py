@@ -13,29 +13,17 @@ from gapr_core.registration.problem.target import PreparedTarget
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of errors that no residual shows, or that few points cannot show.
+    """Standard deviations of errors that no residual shows, or that few points cannot show."""
 
-    Attributes:
-        offset_mm: mean stand-off, outwards; it is subtracted.
-        standoff_mm: stand-off about that mean, the same in all points.
-        noise_mm: noise of a point.
-        bias_mm: typical size of the smooth bias.
-        scale: relative error of the size.
-        local_mm: error that only near points share, such as a slice that the tracker misplaces.
-        along_beam: stand-off and scale act along one beam, as depths of an image do, not along each point's normal.
-        tracking_mm: error of the whole cloud's place, along each axis.
-        tracking_deg: error of its attitude about its centroid, about each axis.
-    """
-
-    offset_mm: float
-    standoff_mm: float
-    noise_mm: float
-    bias_mm: float
-    scale: float
-    local_mm: float = 0.0
-    along_beam: bool = False
-    tracking_mm: float = 0.0
-    tracking_deg: float = 0.0
+    offset_mm: float  # mean stand-off, outwards; it is subtracted
+    standoff_mm: float  # stand-off about that mean, the same in all points
+    noise_mm: float  # noise of a point
+    bias_mm: float  # typical size of the smooth bias
+    scale: float  # relative error of the size
+    local_mm: float = 0.0  # error that only near points share, such as a slice that the tracker misplaces
+    along_beam: bool = False  # stand-off and scale act along one beam, as in depth images, not along each normal
+    tracking_mm: float = 0.0  # error of the whole cloud's place, along each axis
+    tracking_deg: float = 0.0  # error of its attitude about its centroid, about each axis
 
     @property
     def place_covariance(self) -> NDArray[np.float64]:

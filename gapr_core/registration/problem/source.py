@@ -28,29 +28,17 @@ SPARE_NEIGHBOURS = 6  # of a point, for means over neighbours on the bone
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
-    """A cleaned source.
+    """A cleaned source."""
 
-    Attributes:
-        points: (N, 3) float64, mm, source frame: the points that are fitted and assessed.
-        normals: (N, 3) unit normals, of arbitrary sign unless `oriented`.
-        flatness_mm: (N,) root-mean-square distance of a point's neighbours to their plane.
-        around: (N, k) indices of each point's nearest points, itself first, and a few more than give a normal.
-        whole: (M, 3), mm, the cloud that `points` are drawn from: `patches` index it, and the network sees it.
-        patches: (N, k) indices into `whole` of the points that gave each normal.
-        order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
-        spacing_mm: median distance between neighbouring points of the whole.
-        oriented: the normals point out of the body, towards the sensor, so their sign has a meaning.
-    """
-
-    points: Array
-    normals: Array
-    flatness_mm: Array
-    around: NDArray[np.int64]
-    whole: Array
-    patches: NDArray[np.int64]
-    order: NDArray[np.int64]
-    spacing_mm: float
-    oriented: bool = False
+    points: Array  # (N, 3) mm, source frame: the points that are fitted and assessed
+    normals: Array  # (N, 3) unit normals, of arbitrary sign unless `oriented`
+    flatness_mm: Array  # (N,) root-mean-square distance of a point's neighbours to their plane
+    around: NDArray[np.int64]  # (N, k) indices of each point's nearest, itself first, a few more than give a normal
+    whole: Array  # (M, 3) mm, the cloud that `points` are drawn from: `patches` index it, and the network sees it
+    patches: NDArray[np.int64]  # (N, k) indices into `whole` of the points that gave each normal
+    order: NDArray[np.int64]  # (N,) indices whose every prefix is spread over the whole cloud, trustworthy points first
+    spacing_mm: float  # median distance between neighbouring points of the whole
+    oriented: bool = False  # the normals point out of the body, towards the sensor, so their sign has a meaning
 
     @property
     def is_part(self) -> bool:
@@ -69,11 +57,6 @@ class PreparedSource:
             return axes
         away = np.einsum("ni,ni->n", axes[:, 2], self.normals[chosen]) < 0.0
         return np.asarray(axes * np.where(away[:, None], [1.0, -1.0, -1.0], 1.0)[..., None])
-
-    @property
-    def noise_mm(self) -> float:
-        """Roughness of the source alone: median distance of neighbours to their plane, mm."""
-        return float(np.median(self.flatness_mm))
 
     def facing(self, viewpoint: Array) -> PreparedSource:
         """Turn the normals to the viewpoint, mm, (3,) or one for each point (N, 3)."""

@@ -39,15 +39,14 @@ class PreparedTarget:
     Attributes:
         points: (M, 3) float64, mm, evenly thinned, visible from outside.
         normals: (M, 3) unit, outward.
-        shapes: (M, 3, 3) second fundamental forms, 1/mm (see `quadrics.fit_quadrics`).
         tree: k-d tree of the points.
         field: nearest points and distances on a grid.
         anchors: (A,) indices of evenly spread points where the search places the source.
         spacing_mm: median distance between neighbouring points.
         surface: the loaded surface, mm, for display.
         both_cortices: the same with the inner cortex of a hollow bone, for a source that follows both; else None.
-        elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
-            surroundings, at an edge or a thin blade) side by side, for the compiled loops.
+        elements: (M, 13) points, normals, shapes (second fundamental forms xx xy xz yy yz zz, 1/mm) and variances
+            (mm^2: how badly an element fits its surroundings, at an edge or a thin blade), for the compiled loops.
         cache: results that proposers keep per target (a network's features).
         drawn: (S, 6) points and normals, `points` among them and those of flat ends and of an inner cortex.
         offset_mm: distance of the surface that a sensor sees from `points`, outwards; in `elements`.
@@ -55,7 +54,6 @@ class PreparedTarget:
 
     points: Array
     normals: Array
-    shapes: Array
     tree: cKDTree
     field: DistanceField
     anchors: NDArray[np.int64]
@@ -164,7 +162,6 @@ def _described(
     return PreparedTarget(
         points=points,
         normals=normals,
-        shapes=shapes,
         tree=tree,
         field=distance_field.build(points, normals, spacing_mm, config.field_reach_mm, num_threads=num_threads),
         anchors=sampling.thin(points, config.anchors),

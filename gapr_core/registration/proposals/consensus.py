@@ -19,18 +19,12 @@ APART_MM, APART_DEG = 8.0, 8.0  # poses within both are the same
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Point pairs that may belong together.
+    """Point pairs that may belong together."""
 
-    Attributes:
-        source, target: (C, 3) mm.
-        score: (C,) positive weights.
-        patch: (C,) int, correspondences of one patch pair share a number.
-    """
-
-    source: Array
-    target: Array
-    score: Array
-    patch: NDArray[np.int64]
+    source: Array  # (C, 3), mm
+    target: Array  # (C, 3), mm
+    score: Array  # (C,) positive weights
+    patch: NDArray[np.int64]  # (C,) correspondences of one patch pair share a number
 
     @cached_property
     def products(self) -> Array:
@@ -38,7 +32,7 @@ class Correspondences:
         return (self.source[:, :, None] * self.target[:, None, :]).reshape(-1, 9)
 
 
-def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> tuple[Array, Array]:
+def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> Array:
     """Fit a pose per patch pair by weighted SVD, score all, and refine on inliers (GeoTransformer's LGR).
 
     Args:
@@ -47,7 +41,7 @@ def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -
         count: most poses returned.
 
     Returns:
-        (K, 4, 4) distinct T_target_source, best first, and (K,) summed scores of the agreeing correspondences.
+        (K, 4, 4) distinct T_target_source, mm; first the one whose agreeing correspondences score most.
     """
     patches = np.unique(found.patch, return_counts=True)
     large = patches[0][patches[1] >= 3]
@@ -55,10 +49,10 @@ def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -
     return converge(batched_kabsch(found, members), found, radius_mm, count)
 
 
-def converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> tuple[Array, Array]:
+def converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> Array:
     """Refit the best poses to the correspondences that agree with them, and drop near-copies."""
     if len(poses) == 0:
-        return np.empty((0, 4, 4)), np.empty(0)
+        return np.empty((0, 4, 4))
     centroid = found.source.mean(axis=0)
     scores = _support(poses, found, radius_mm).sum(axis=1)
     poses = poses[distinct(poses, scores, centroid, 2 * count)]
@@ -68,8 +62,7 @@ def converge(poses: Array, found: Correspondences, radius_mm: float, count: int)
         refitted = batched_kabsch(found, weights)
         poses = np.where(enough[:, None, None], refitted, poses)
     scores = _support(poses, found, radius_mm).sum(axis=1)
-    kept = distinct(poses, scores, centroid, count)
-    return poses[kept], scores[kept]
+    return poses[distinct(poses, scores, centroid, count)]
 
 
 def distinct(poses: Array, scores: Array, centroid: Array, count: int) -> NDArray[np.int64]:

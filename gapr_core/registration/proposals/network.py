@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,9 @@ from gapr_core.model.pyramid import Frame, build_cloud, target_frame
 from gapr_core.model.types import Cloud, Features, Matches
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.consensus import Correspondences, local_to_global
 
 Array = NDArray[np.float64]
-Consensus = Callable[[Correspondences, float, int], tuple[Array, Array]]
 RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # radius of agreement of a correspondence, over the first voxel
 SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
@@ -32,23 +29,19 @@ class NetworkProposer:
 
     Args:
         network: in evaluation mode, on any device.
-        count: most poses for one pair.
         weights_name: key of the target's cached features, with the device, so that networks of the
             same weights share them; without a name they are the network's alone.
-        consensus: finds poses (K, 4, 4), best first, and their scores in correspondences, within a radius, mm.
     """
 
-    def __init__(
-        self, network: GAPRNet, count: int = 32, weights_name: str = "", consensus: Consensus = local_to_global
-    ) -> None:
-        self.network, self.count, self.consensus = network.eval(), count, consensus
+    def __init__(self, network: GAPRNet, weights_name: str = "") -> None:
+        self.network = network.eval()
         self.name = "network"
         self.is_shipped = False  # the shipped confidence was fitted to these weights
         self._key = "network", weights_name or network  # the network itself: an id may recur
         _survive_forks()
 
     @classmethod
-    def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu", **options: Any) -> NetworkProposer:
+    def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu") -> NetworkProposer:
         """Load the network of a safetensors file; the shipped one without a path.
 
         Raises:
@@ -59,20 +52,20 @@ class NetworkProposer:
 
         network = weights.load(path, _available(device))[0]
         name = f"{weights.checksum(dict(network.state_dict()))} {json.dumps(network.config.to_dict())}"
-        proposer = cls(network, weights_name=name, **options)
+        proposer = cls(network, name)
         proposer.is_shipped = Path(path).resolve() == SHIPPED.resolve()
         return proposer
 
-    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
         """Propose distinct poses, best first; none where the source is too small or too large for the network."""
         frame, cloud, features = self.prepare(target)
         try:
             moving = build_cloud(source.whole, frame, self.network.config)
         except InvalidPointCloudError:
-            return Proposals(np.empty((0, 4, 4)), np.empty(0))
+            return np.empty((0, 4, 4))
         found = self.match(moving, cloud, features)
         radius_mm = RADIUS_VOXELS * max(SMALLEST_VOXEL_MM, frame.voxel * frame.scale_mm)
-        return Proposals(*self.consensus(found, radius_mm, self.count))
+        return local_to_global(found, radius_mm)
 
     def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:
         """Compute the target's pyramid and features once, and keep them with it."""

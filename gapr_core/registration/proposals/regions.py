@@ -22,7 +22,6 @@ from gapr_core.geometry import sampling
 from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 
 Array = NDArray[np.float64]
@@ -34,15 +33,10 @@ TRIES = 3  # seeds for each requested region, since some grow too small a region
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of a source that may be bone alone.
+    """A part of a source that may be bone alone."""
 
-    Attributes:
-        source: its points as a source of their own.
-        centre: (3,) its seed, mm, source frame.
-    """
-
-    source: PreparedSource
-    centre: Array
+    source: PreparedSource  # its points as a source of their own
+    centre: Array  # (3,) its seed, mm, source frame
 
 
 def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Region]]:
@@ -125,8 +119,8 @@ def _part(source: PreparedSource, members: Indices) -> PreparedSource:
     )
 
 
-def search(region: Region, target: PreparedTarget, config: ClutterConfig) -> Proposals:
-    """Search hypotheses of one region."""
+def search(region: Region, target: PreparedTarget, config: ClutterConfig) -> Array:
+    """Search hypotheses (K, 4, 4) of one region."""
     few = SearchConfig(
         references=config.references,
         spins=config.spins,

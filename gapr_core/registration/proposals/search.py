@@ -1,4 +1,4 @@
-"""The weight-free proposer: every placement of a source normal on a target normal.
+"""The interface of proposers, and the weight-free one: every placement of a source normal on a target normal.
 
 A reference point of the source is put on an anchor of the target, normal on normal, and turned about the normal in
 steps. Each pose is scored by the distances of a few probe points in the target's distance field. Both signs of a normal
@@ -8,6 +8,7 @@ are tried unless the sensor's place decides it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numba
 import numpy as np
@@ -18,12 +19,28 @@ from gapr_core.geometry import quadrics, sampling
 from gapr_core.geometry.distance_field import FARTHEST, DistanceField
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposals
 from gapr_core.runtime.parallel import in_threads
 
 Array = NDArray[np.float64]
 
 CANDIDATES = 8  # points of the spread order for each reference to choose from
+
+
+class Proposer(Protocol):
+    """Suggests poses; verification decides. A right one among many wrong ones is a success."""
+
+    @property
+    def name(self) -> str:
+        """Name in tables and logs."""
+        ...
+
+    def prepare(self, target: PreparedTarget) -> object:
+        """Prepare a target, so that the first `propose` is as fast as later ones; kept in its `cache`."""
+        ...
+
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
+        """Propose poses (K, 4, 4) T_target_source, mm, best first, for one pair; may be none."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,7 +54,7 @@ class NormalAlignedSearch:
     def prepare(self, target: PreparedTarget) -> None:
         """Prepare nothing: the distance field is part of every prepared target."""
 
-    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
         """Find the best spin of every (reference, sign, anchor), and return the best `keep` of them all."""
         references = _references(source, self.config.references)
         signs = np.array([1.0] if source.oriented else [1.0, -1.0])
@@ -50,8 +67,7 @@ class NormalAlignedSearch:
         view, anchor = np.unravel_index(best, score.shape)
         angles = 2.0 * np.pi * spin[view, anchor] / self.config.spins
         reference, sign = references[view // len(signs)], signs[view % len(signs)]
-        poses = _poses(source, reference, sign, angles, target, anchor_axes, anchor)
-        return Proposals(poses, -score[view, anchor].astype(np.float64))
+        return _poses(source, reference, sign, angles, target, anchor_axes, anchor)
 
     def _score(
         self, local: NDArray[np.float32], anchors: NDArray[np.float32], axes: NDArray[np.float32], field: DistanceField

@@ -42,17 +42,12 @@ SMALLEST_SCORE = 1e-4  # lower scores, negative ones too, count as this
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Hypotheses between two stages.
+    """Hypotheses between two stages."""
 
-    Attributes:
-        poses: (K, 4, 4) T_target_source, mm.
-        region: (K,) index of the region that proposed each; `GIVEN` for a given pose.
-        scores: (K,) scores of lines of sight (`Visible.score`), large is good; 0 before the first stage. Comparable
-            within one stage, since each has tolerances of its own.
-    """
-
-    poses: Array
-    region: NDArray[np.int64]
+    poses: Array  # (K, 4, 4) T_target_source, mm
+    region: NDArray[np.int64]  # (K,) index of the region that proposed each; `GIVEN` for a given pose
+    # (K,) scores of lines of sight (`Visible.score`), large is good; 0 before the first stage. Comparable within one
+    # stage, since each has tolerances of its own
     scores: Array
 
     def __getitem__(self, some: NDArray[np.int64]) -> Pool:
@@ -100,11 +95,10 @@ def possible_view(source: ArrayLike, config: RegistrarConfig) -> PreparedSource 
 
 def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
     """Propose hypotheses of all regions, each refined on its own region, and the start poses (K, 4, 4)."""
-    steps = steps_on(target, config.region_limits_mm, config)
 
     def work(region: Region) -> Array:
-        poses = regions.search(region, target, config).poses
-        return steps.refined(poses, region.source, region.source.order[: config.region_points])
+        poses, some = regions.search(region, target, config), region.source.order[: config.region_points]
+        return refine_on(region.source, some, target, config.region_limits_mm, 1.0, poses)
 
     found = in_threads(work, scene.regions, num_threads=num_threads)
     label = np.repeat(np.arange(GIVEN, len(found)), [len(start), *map(len, found)])
@@ -127,12 +121,7 @@ def verify(
     best = _best_distinct(crowd, scene, config, config.final_poses)
     best = refine_on_all(best if start is None else given(start) + best, scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
-    return Candidates(best.poses, small_is_good(best.scores), shares)
-
-
-def small_is_good(scores: Array) -> Array:
-    """Invert (K,) scores of lines of sight to those of `Candidates`, where small is good and a ratio counts."""
-    return np.asarray(1.0 / np.maximum(scores, SMALLEST_SCORE))
+    return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), shares)
 
 
 def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:
@@ -145,7 +134,6 @@ def refine_around(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
     """Refine each pose on the points around its region and hardly in front of the bone, and score it again."""
-    steps = steps_on(target, config.middle_limits_mm, config, config.front_share)
     tree = cKDTree(scene.source.points[scene.source.order])
     poses = pool.poses.copy()
 
@@ -154,7 +142,8 @@ def refine_around(
         is_given = label == GIVEN
         near = np.arange(config.middle_points) if is_given else _around(tree, scene.regions[label].centre, config)
         some = scene.source.order[near[near < len(scene.source.order)]]
-        poses[of_it] = steps.refined(pool.poses[of_it], scene.source, some)
+        how = target, config.middle_limits_mm, config.front_share
+        poses[of_it] = refine_on(scene.source, some, *how, pool.poses[of_it])
 
     in_threads(work, np.unique(pool.region), num_threads=num_threads)
     pool = replace(pool, poses=poses)
@@ -170,8 +159,8 @@ def refine_on_all(
     """
     some, refined = scene.source.order[: config.final_points], []
     for front_share in (1.0, config.front_share):
-        steps = steps_on(target, config.final_limits_mm, config, front_share)
-        refined += in_pieces(partial(steps.refined, source=scene.source, some=some), pool.poses, num_threads)
+        refine = partial(refine_on, scene.source, some, target, config.final_limits_mm, front_share)
+        refined += in_pieces(refine, pool.poses, num_threads)
     pool = replace(pool + pool, poses=np.concatenate(refined))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
     return _best_distinct(pool, scene, config, config.kept_poses)
@@ -188,30 +177,21 @@ def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.i
     return near[:: max(1, len(near) // config.middle_points)]
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """Gauss-Newton steps on a target, on points whose normals agree up to a cosine.
+def refine_on(
+    source: PreparedSource,
+    some: NDArray[np.int64],
+    target: PreparedTarget,
+    limits_mm: tuple[float, float, int],
+    front_share: float,
+    poses: Array,
+) -> Array:
+    """Refine poses (K, 4, 4) on some points, those whose normals agree with the target's, by falling limits.
 
-    One step per row of limits (I, 2), mm, those of points inside and outside of the target.
+    The limits (first, last, number), mm, are scaled by `front_share` in front of the bone.
     """
-
-    target: PreparedTarget
-    limits_mm: Array
-    same_surface_cos: float
-
-    def refined(self, poses: Array, source: PreparedSource, some: NDArray[np.int64]) -> Array:
-        """Refine poses (K, 4, 4) on some of the points."""
-        points, normals, surface = source.points[some], source.normals[some], self.target.kernel_view
-        how = source.oriented, *surface, self.limits_mm, self.same_surface_cos
-        return np.asarray(refine_agreeing(np.ascontiguousarray(poses), points, normals, *how))
-
-
-def steps_on(
-    target: PreparedTarget, limits_mm: tuple[float, float, int], config: ClutterConfig, front_share: float = 1.0
-) -> Steps:
-    """Build steps of falling limits (first, last, number), mm, scaled by `front_share` in front of the bone."""
     both = np.outer(np.linspace(*limits_mm), [1.0, front_share])
-    return Steps(target, both, SAME_SURFACE_COS)
+    how = source.oriented, *target.kernel_view, both, SAME_SURFACE_COS
+    return np.asarray(refine_agreeing(np.ascontiguousarray(poses), source.points[some], source.normals[some], *how))
 
 
 def _scored(

@@ -33,36 +33,23 @@ VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # costs of the violating share, and of
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """A source as a pinhole image of its camera, which looks at the middle of the cloud.
+    """A source as a pinhole image of its camera, which looks at the middle of the cloud."""
 
-    Attributes:
-        T_camera_source: (4, 4), mm; the camera looks along its z.
-        pixels: (rows, columns, 6) float32: unit normal (3) of the measured surface towards the camera and its offset
-            n . p, depth z of the measured point, smallest depth of the 3 x 3 pixels around. Camera frame, mm; the depth
-            is 0 where nothing was measured.
-        origin: (2,) x / z and y / z of the middle of pixel (0, 0).
-        pixel: edge of a pixel as a difference of x / z.
-    """
-
-    T_camera_source: Array
+    T_camera_source: Array  # (4, 4), mm; the camera looks along its z
+    # (rows, columns, 6), mm, camera frame: unit normal (3) of the measured surface towards the camera, its offset
+    # n . p, depth z of the measured point (0 where there is none), smallest depth of the 3 x 3 pixels around
     pixels: NDArray[np.float32]
-    origin: Array
-    pixel: float
+    origin: Array  # (2,) x / z and y / z of the middle of pixel (0, 0)
+    pixel: float  # edge of a pixel as a difference of x / z
 
 
 @dataclass(frozen=True, eq=False)
 class Visible:
-    """Agreement of poses with an image, as shares of the target's surface.
+    """Agreement of poses with an image, as shares of the target's surface."""
 
-    Attributes:
-        explained: (K,) share that faces the camera and lies on the measured surface.
-        violating: (K,) share that lies clearly in front of the measured surface.
-        compared: (K,) share that faces the camera and is visible: neither outside the image nor hidden.
-    """
-
-    explained: Array
-    violating: Array
-    compared: Array
+    explained: Array  # (K,) share that faces the camera and lies on the measured surface
+    violating: Array  # (K,) share that lies clearly in front of the measured surface
+    compared: Array  # (K,) share that faces the camera and is visible: neither outside the image nor hidden
 
     @property
     def score(self) -> Array:

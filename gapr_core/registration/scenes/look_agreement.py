@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.fit import kernels
+from gapr_core.registration.fit.refinement import distances_mm
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.scenes.scene import Scene
@@ -40,24 +40,15 @@ FEWEST_POINTS, MOST_POINTS = 40, 600  # points of a look that are laid on the bo
 
 
 class LookShares(NamedTuple):
-    """Agreement of one look by itself, as shares of the target's surface.
+    """Agreement of one look by itself, as shares of the target's surface."""
 
-    Attributes:
-        compared: share visible to it under the common pose.
-        on: share on its measured surface, at the scale of the noise (`clutter.on_mm`).
-        near: share near that surface (`clutter.middle_on_mm`).
-        seen_through: share in front of that surface.
-        own_compared, own_on: the first two under its own pose.
-        away_mm: root mean square distance between the two poses, over its points near the bone.
-    """
-
-    compared: float
-    on: float
-    near: float
-    seen_through: float
-    own_compared: float
-    own_on: float
-    away_mm: float
+    compared: float  # share visible to it under the common pose
+    on: float  # share on its measured surface, at the scale of the noise (`clutter.on_mm`)
+    near: float  # share near that surface (`clutter.middle_on_mm`)
+    seen_through: float  # share in front of that surface
+    own_compared: float  # as `compared`, under its own pose
+    own_on: float  # as `on`, under its own pose
+    away_mm: float  # root mean square distance between the two poses, over its points near the bone
 
     def share(self, of_surface: float) -> float:
         """Divide a share of the surface by the compared one."""
@@ -118,8 +109,7 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
     """Judge the fit of each of K looks to their common pose (4, 4); a single look fits."""
     if len(scene.images) == 1:
         return [LookFit.FITS]
-    signed, _, aside, _ = kernels.residuals_at(T, scene.source.points, *target.kernel_view, 0.0)
-    close = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM
+    close = distances_mm(T, scene.source.points, target) < REACH_MM
     shares = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
     widest = max(each.compared for each in shares)
     blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in shares])
@@ -158,7 +148,7 @@ def _shares_of_look(
     own, settings, threads = T, config.clutter, config.num_threads
     if len(close) >= FEWEST_POINTS:
         some = close[:: -(-len(close) // MOST_POINTS)]
-        own = clutter.steps_on(target, LIMITS_MM, settings).refined(T[None], source, some)[0]
+        own = clutter.refine_on(source, some, target, LIMITS_MM, 1.0, T[None])[0]
     points, normals = clutter.spread(target, settings.final_target_points)
     alone, poses = scene.each[number], np.stack([T, own])
     near, on = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,67 +31,29 @@ HOW = "pass x, y, z in mm: where the camera was, or where it was for each point"
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A view from one place.
+    """A view from one place."""
 
-    Attributes:
-        points: (N, 3), mm, source frame.
-        viewpoint: (3,), mm, source frame: place of the camera.
-    """
-
-    points: Array
-    viewpoint: Array
+    points: Array  # (N, 3) finite, mm, source frame
+    viewpoint: Array  # (3,), mm, source frame: place of the camera
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Places of the camera for each point of a cloud; two of the places may be the same.
-
-    Attributes:
-        viewpoints: (K, 3), mm, source frame.
-        look: (N,) index of the place that each point was seen from.
-    """
-
-    viewpoints: Array
-    look: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, seen: Sequence[Look]) -> Places:
-        """Collect the places of looks whose points follow each other in one cloud."""
-        viewpoints = np.reshape([look.viewpoint for look in seen], (-1, 3))
-        return cls(viewpoints, np.repeat(np.arange(len(seen)), [len(look.points) for look in seen]))
-
-
-Viewpoint = ArrayLike | Places  # (3,) or (N, 3) mm, or places by their numbers
+Viewpoint = ArrayLike | Sequence[Look]  # (3,) or (N, 3) mm, or the looks themselves
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera's view from K places.
+    """A camera's view from K places."""
 
-    Attributes:
-        source: the cloud, with normals towards the camera.
-        images: image of each place.
-        viewpoints: (K, 3) mm, source frame: the places.
-        look: (N,) index of each point's place.
-        regions: parts of it that may be bone alone.
-        each: view from each place, as a scene of its own; () of a single one.
-        names: (K,) number of each place among the given ones.
-        given: (G, 3) mm, source frame: the given places, also those with too few points.
-    """
-
-    source: PreparedSource
-    images: tuple[DepthImage, ...]
-    viewpoints: Array
-    look: NDArray[np.int64]
-    regions: Sequence[Region] = ()
-    each: tuple[Scene, ...] = ()
+    source: PreparedSource  # the cloud, with normals towards the camera
+    images: tuple[DepthImage, ...]  # image of each place
+    viewpoints: Array  # (K, 3) mm, source frame: the places
+    look: NDArray[np.int64]  # (N,) index of each point's place
+    regions: Sequence[Region] = ()  # parts of it that may be bone alone
+    each: tuple[Scene, ...] = ()  # view from each place, as a scene of its own; () of a single one
+    # (K,) number of each place among the given ones
     names: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    # (G, 3) mm, source frame: the given places, also those with too few points
     given: Array = field(default_factory=lambda: np.empty((0, 3)))
-
-    @property
-    def viewpoint(self) -> Array:
-        """(3,) mm, middle of the places."""
-        return np.asarray(self.viewpoints.mean(axis=0))
 
     def part(self, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
         """Cut some of its points into a source of their own, with normals towards the camera.
@@ -113,32 +76,33 @@ class Scene:
 def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
     """Split the finite points of a cloud (N, 3), mm, by the place of its camera: one for all, or one for each point.
 
+    Looks in place of a viewpoint are the cloud, split already.
+
     Raises:
         InvalidPointCloudError: a viewpoint of another shape, or one that is not finite; more than `MOST_PLACES` places.
     """
-    if isinstance(viewpoint, Places):
-        points, places, look = np.asarray(source, dtype=np.float64), viewpoint.viewpoints, viewpoint.look
-    elif as_array(viewpoint, "a viewpoint", HOW).ndim < 2:
-        return [Look(finite_points(source), inputs.numbers(viewpoint, (3,), "viewpoint", HOW))]
-    else:
-        points, places, look = _by_place(source, viewpoint)
-    if len(places) > MOST_PLACES:
-        how = "pass the last images, or those from places that differ most"
-        raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
-    looks = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
-    return looks or [Look(points, np.zeros(3))]  # of no point at all
+    places = as_array(viewpoint, "a viewpoint", HOW)
+    if places.size and isinstance(places.flat[0], Look):
+        return list(places)
+    if places.ndim < 2:
+        return [Look(finite_points(source), inputs.numbers(places, (3,), "viewpoint", HOW))]
+    return _by_place(as_points(source), places)
 
 
-def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return the finite points (N, 3) of a cloud, its different places (K, 3), sorted, and (N,) each point's place."""
-    points, of_points = as_points(source), as_array(viewpoint, "a viewpoint", HOW)
+def _by_place(points: Array, of_points: NDArray[Any]) -> list[Look]:
+    """Split finite points of a cloud (N, 3) by the camera's places (N, 3); looks are sorted by place."""
     usable = is_point(points)
     if of_points.shape == points.shape and of_points.dtype.kind == "f":
         of_points = np.where(usable[:, None], of_points, 0.0)
     of_points = inputs.numbers(of_points, points.shape, "viewpoint", HOW)[usable]
     begins = np.append(True, (np.diff(of_points, axis=0) != 0.0).any(axis=1))[: len(of_points)]  # runs from one place
     places, of_run = np.unique(of_points[begins], axis=0, return_inverse=True)
-    return points[usable], places, of_run.reshape(-1)[np.cumsum(begins) - 1]
+    if len(places) > MOST_PLACES:
+        how = "pass the last images, or those from places that differ most"
+        raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
+    points, look = points[usable], of_run.reshape(-1)[np.cumsum(begins) - 1]
+    looks = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
+    return looks or [Look(points, np.zeros(3))]  # of no point at all
 
 
 def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:

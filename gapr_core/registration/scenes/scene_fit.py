@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,24 +31,8 @@ SAY_WHERE = ", or say where the camera was (viewpoint)"
 RIVAL_IF_ALONE = 1.0  # score of the assumed rival of a pose alone, over its own: as good, the careful choice
 
 
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """The part of a scene that a pose explains.
-
-    Attributes:
-        source: the part, as a source of its own.
-        members: (N,) mask of the part's points in the scene.
-        fit: the pose, refined on the part alone.
-    """
-
-    source: PreparedSource
-    members: NDArray[np.bool_]
-    fit: Fit
-
-    @property
-    def share(self) -> float:
-        """Share of the scene's points that count for the pose, 0 to 1."""
-        return float(self.fit.counts.sum() / len(self.members))
+# the part of a scene that a pose explains: as a source, its (N,) mask in the scene, and the pose refined on it alone
+Explained = tuple[PreparedSource, NDArray[np.bool_], Fit]
 
 
 def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Explained:
@@ -62,7 +44,7 @@ def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConf
         part = scene.part(members, config)
         fit = refine_fully(T, part.points, target, config.refinement, part.neighbours)
         T = fit.T
-    return Explained(part, members, fit)
+    return part, members, fit
 
 
 def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> NDArray[np.bool_]:
@@ -83,11 +65,12 @@ def assess_part(
     config: RegistrarConfig,
 ) -> Assessment:
     """Assess a pose that explains a part of a scene; see `assess_fit`."""
-    seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
-    of_view = features_of_view(seen, candidates, target) | {"inlier_ratio": explained.share}
-    members, look = explained.members, scene.look[explained.members] if len(scene.images) > 1 else None
-    view = {"seen": scene.source, "members": members, "viewpoint": scene.viewpoint, "look": look}
-    return assess_fit(explained.fit, candidates, explained.source, target, classifier, config, of_view, **view)
+    source, members, fit = explained
+    seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
+    of_view = features_of_view(seen, candidates, target) | {"inlier_ratio": float(fit.counts.sum() / len(members))}
+    look = scene.look[members] if len(scene.images) > 1 else None
+    view = {"seen": scene.source, "members": members, "viewpoint": scene.viewpoints.mean(axis=0), "look": look}
+    return assess_fit(fit, candidates, source, target, classifier, config, of_view, **view)
 
 
 def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding | None:

@@ -10,19 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
-from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
+from gapr_core.geometry.twists import bound_mm, covariance_about, predicted_rmse_mm
 from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks.conclude import by_threshold
-from gapr_core.registration.checks.deformation import covariance_of_half
+from gapr_core.registration.checks.deformation import covariance_of_half, of_motion
 from gapr_core.registration.fit.refinement import distances_mm, refine_fully
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
-from gapr_core.registration.streams import motion_test
 from gapr_core.registration.streams.collection import MOST_OFF, Collection, together
 from gapr_core.registration.streams.evidence import fingerprint, is_repeated
 from gapr_core.registration.streams.tracker import Tracker
-from gapr_core.registration.uncertainty import target_error
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime.parallel import single_threaded_libraries
 
@@ -43,7 +41,7 @@ class Accumulator(Collection):
     All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. A source off the
     bone under this or the last accepted pose is left out, and the answer refused if it is the newest. After three in a
     row the bone or its reference has moved, and only these are kept. Where all show that the bone moves (see
-    `motion_test`), the answer is refused, and those since a step or the last third are kept.
+    `of_motion`), the answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers the collected sources; a `Tracker` is not changed but copied to one whose sources count as one
@@ -158,11 +156,11 @@ class Accumulator(Collection):
             self.reset()
             self._kept = moved[-self.most :]
             why = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
-            return _refused(result, why)
+            return result.refused(RegistrationStatus.LOW_CONFIDENCE, why)
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             why = f"the {newest} off the bone where the others found it: left out"
-            return _refused(result, why)
+            return result.refused(RegistrationStatus.LOW_CONFIDENCE, why)
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
@@ -174,17 +172,16 @@ class Accumulator(Collection):
         some = slice(None, None, 1 + len(order) // MOST_POINTS)
         points, seen = np.ascontiguousarray(together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
-        motion = motion_test.of_motion(fit, order[some])
-        ratio = motion.shown.log_ratio
-        if ratio <= MAY_MOVE:
+        motion, rests_from = of_motion(fit, order[some])
+        if motion.log_ratio <= MAY_MOVE:
             return result
-        if ratio <= MOVES or len(kept) < FEWEST_IN_TIME:
-            added = covariance_of_half(fit, motion.shown.size_mm)
+        if motion.log_ratio <= MOVES or len(kept) < FEWEST_IN_TIME:
+            added = covariance_of_half(fit, motion.size_mm)
             return self._widened(result, added, fit.moved.mean(axis=0), target)
         self.reset()
-        self._kept = kept[-(len(kept) // 3) :] if motion.rests_from is None else kept[motion.rests_from :]
+        self._kept = kept[-(len(kept) // 3) :] if rests_from is None else kept[rests_from:]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
-        return _refused(result, f"{why}; look at what is fixed to the bone")
+        return result.refused(RegistrationStatus.LOW_CONFIDENCE, f"{why}; look at what is fixed to the bone")
 
     def _widened(
         self, result: RegistrationResult, added: Array, about_mm: Array, target: PreparedTarget
@@ -194,7 +191,7 @@ class Accumulator(Collection):
             return result
         covariance = result.covariance + covariance_about(result.centre_mm - about_mm, added)
         tre_mm = predicted_rmse_mm(covariance, target.points, result.centre_mm)
-        tre95_mm = result.factor95 * target_error.bound_mm(covariance, target.points, result.centre_mm)
+        tre95_mm = result.factor95 * bound_mm(covariance, target.points, result.centre_mm)
         refusal = by_threshold(result.confidence, result.confidence, tre95_mm, self.config)
         if refusal is not None:
             return result.refused(refusal.status, refusal.text)
@@ -219,14 +216,13 @@ class Accumulator(Collection):
 
     def _join_small_ones(self, source: Array) -> list[Array]:
         """Add a source (N, 3); returns it to judge, a small one with those before it; [] for too few points."""
-        fewest = FEWEST_POINTS
-        if len(source) >= fewest:
+        if len(source) >= FEWEST_POINTS:
             self._small = []
             return [source]
         self._small = [*self._small, source]
-        while sum(map(len, self._small[1:])) >= fewest:
+        while sum(map(len, self._small[1:])) >= FEWEST_POINTS:
             self._small = self._small[1:]
-        return self._small if sum(map(len, self._small)) >= fewest else []
+        return self._small if sum(map(len, self._small)) >= FEWEST_POINTS else []
 
     def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget, least_mm: float = 0.0) -> bool:
         """Return True where the median distance of a source (N, 3) is far above that of all points, and `least_mm`."""
@@ -243,7 +239,7 @@ class Accumulator(Collection):
         T, covariance, centre_mm = last.T_target_source, last.covariance, last.centre_mm
         if T is None or covariance is None or centre_mm is None:  # as of methods that predict no error
             return False
-        least_mm = last.factor95 * target_error.bound_mm(covariance, se3.apply(T, source), centre_mm)
+        least_mm = last.factor95 * bound_mm(covariance, se3.apply(T, source), centre_mm)
         return self._lies_off(source, together(before), T, target, least_mm)
 
 
@@ -254,8 +250,3 @@ def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> flo
 
 def _is_among(source: Array, others: list[Array]) -> bool:
     return any(np.array_equal(source, other) for other in others)
-
-
-def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
-    """Refuse a pose because the bone has moved."""
-    return result.refused(RegistrationStatus.LOW_CONFIDENCE, reason)

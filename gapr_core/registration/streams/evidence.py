@@ -9,7 +9,6 @@ evidence, never beyond m / rho: counting makes nothing certain. `gapr_core.calib
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,23 +30,6 @@ def is_repeated(cloud: NDArray[np.float64], before: NDArray[np.float64]) -> bool
     return bool(np.abs(cloud - before).max() <= SAME_MM)
 
 
-class State(NamedTuple):
-    """Sums over the frames of a stream, older ones with less weight.
-
-    Attributes:
-        total: (2,) log odds of the pose, and evidence of the bone.
-        weight: (2,) sum of the weights.
-        frames: frames that agree, up to the last one.
-    """
-
-    total: np.ndarray
-    weight: np.ndarray
-    frames: int
-
-
-EMPTY = State(np.zeros(2), np.zeros(2), 0)
-
-
 class Evidence:
     """Combined numbers of a stream on one target: observe each frame, reset with another target.
 
@@ -61,7 +43,9 @@ class Evidence:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._now = self._before = EMPTY
+        # sums over the frames, older ones with less weight: (2,) log odds of the pose and evidence of the bone,
+        # (2,) weights, and the number of frames that agree, up to the last one
+        self._now = self._before = np.zeros(2), np.zeros(2), 0
 
     def observe(self, frame: Judgement, agrees: bool, again: bool = False) -> Judgement:
         """Judge a frame in the light of those before it.
@@ -75,15 +59,14 @@ class Evidence:
         own = np.array([frame.pose_log_odds, frame.bone_evidence])
         if not np.isfinite(own).all():
             return frame
-        before = self._before if again else self._now
-        self._before = before
+        self._before = self._before if again else self._now
+        total, weight, frames = self._before
         if not agrees:
-            before = State(np.minimum(before.total, 0.0), before.weight * (before.total <= 0.0), 0)
+            total, weight, frames = np.minimum(total, 0.0), weight * (total <= 0.0), 0
         kept = 1.0 - 1.0 / MEMORY
-        frames = before.frames + 1
-        self._now = State(kept * before.total + own, kept * before.weight + 1.0, frames)
-        mean = self._now.total / self._now.weight
-        combined = mean / (self._rho + (1.0 - self._rho) / frames)
+        total, weight, frames = kept * total + own, kept * weight + 1.0, frames + 1
+        self._now = total, weight, frames
+        combined = total / weight / (self._rho + (1.0 - self._rho) / frames)
         if not agrees:
             combined = np.minimum(combined, own)
         limits = np.array([LARGEST_LOG_ODDS, LARGEST_EVIDENCE])

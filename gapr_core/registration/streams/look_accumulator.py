@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +17,7 @@ from gapr_core.registration.caveats import answering
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
-from gapr_core.registration.scenes.scene import HOW, MOST_PLACES, Look, Places
+from gapr_core.registration.scenes.scene import HOW, MOST_PLACES, Look
 from gapr_core.registration.streams.collection import MOST_OFF, Collection, together
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
@@ -58,23 +57,13 @@ REFUSED_FOR = {
 }
 
 
-class Direction(NamedTuple):
-    """Direction of a look: the camera (3,) and the middle (3,) of its points, mm."""
-
-    camera: Array
-    middle: Array
-
-
 @dataclass(frozen=True, eq=False)
 class KeptLook(Look):
-    """A look of the collection.
+    """A look of the collection."""
 
-    Attributes:
-        first: direction of the first of the looks that it replaced in turn; else its own. A camera
-            that moves slowly would else replace each look by the next one, and keep one alone.
-    """
-
-    first: Direction
+    # (2, 3) direction of the first of the looks that it replaced in turn; else its own. A camera that moves slowly
+    # would else replace each look by the next one, and keep one alone
+    first: Array
 
 
 class LookAccumulator(Collection):
@@ -190,7 +179,7 @@ class LookAccumulator(Collection):
         stage_ms: dict[str, float] = {}
         asked = self._looks
         while True:
-            result = self.method.register(_together(asked), target, initial, Places.of(asked))
+            result = self.method.register(_together(asked), target, initial, asked)
             stage_ms = _added(stage_ms, result.stage_ms)
             apart = [look.fit is LookFit.APART for look in result.looks] or [False] * len(asked)
             if apart[-1] or not any(apart) or 2 * sum(apart) >= len(asked):
@@ -207,32 +196,31 @@ class LookAccumulator(Collection):
             return Newest.IS_TOO_SMALL
         if fits[-1] is LookFit.BLIND and may_be_there:
             return Newest.SHOWS_NOTHING
-        if not result.ok:
+        T = result.T_target_source
+        if T is None:
             return Newest.IS_REFUSED
-        verdict = self._of_newest_alone(asked, result, target)
+        verdict = self._of_newest_alone(asked, T, target)
         is_sure = verdict is Newest.AGREES and result.confidence >= self.config.sure_from
-        if verdict in STANDING and not is_sure and self._is_another(result):
+        if verdict in STANDING and not is_sure and self._is_another(T):
             return Newest.CONTRADICTS
         return Newest.IS_DOUBTFUL if verdict is Newest.IS_UNCONFIRMED and "elsewhere" in self._rows else verdict
 
-    def _is_another(self, result: RegistrationResult) -> bool:
-        """Return True where the pose differs from the last one given since the collection began."""
-        if self._last is None or result.T_target_source is None or self.most == 1:
+    def _is_another(self, T: Array) -> bool:
+        """Return True where a pose (4, 4), mm, differs from the last one given since the collection began."""
+        if self._last is None or self.most == 1:
             return False
-        return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
+        return not se3.pose_error(T, self._last, self.collected).is_right
 
-    def _of_newest_alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """Judge the common pose by that of the newest look alone; others from the same direction confirm nothing."""
+    def _of_newest_alone(self, asked: list[KeptLook], T: Array, target: PreparedTarget) -> Newest:
+        """Judge the common pose (4, 4), mm, by the newest look's alone; ones from its direction confirm nothing."""
         if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
-        if result.T_target_source is None:
-            return Newest.AGREES
         newest = asked[-1]
         registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
-        alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
+        alone = registrar.register(newest.points, target, T, newest.viewpoint)
         if alone.T_target_source is None:
             return Newest.IS_UNCONFIRMED
-        if not se3.pose_error(alone.T_target_source, result.T_target_source, newest.points).is_right:
+        if not se3.pose_error(alone.T_target_source, T, newest.points).is_right:
             return Newest.DIFFERS
         own = _direction(newest)
         is_from_elsewhere = any(_apart_deg(_direction(each), own) >= self.apart_deg for each in asked[:-1])
@@ -325,14 +313,14 @@ def _together(looks: Sequence[Look]) -> Array:
     return together([look.points for look in looks])
 
 
-def _direction(look: Look) -> Direction:
-    return Direction(look.viewpoint, look.points.mean(axis=0))
+def _direction(look: Look) -> Array:
+    """Stack the camera's place and the middle of the points, (2, 3), mm."""
+    return np.stack([look.viewpoint, look.points.mean(axis=0)])
 
 
-def _apart_deg(first: Direction, second: Direction) -> float:
+def _apart_deg(first: Array, second: Array) -> float:
     """Measure the larger angle between two directions: of the cameras, seen from the views' middle, and vice versa."""
-    cameras = np.stack([first.camera, second.camera])
-    shown = np.stack([first.middle, second.middle])
+    cameras, shown = np.stack([first, second], axis=1)
     return max(_angle_deg(cameras - shown.mean(axis=0)), _angle_deg(shown - cameras.mean(axis=0)))
 
 

@@ -14,39 +14,33 @@ from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.registrar import Enough, Registrar, never
+from gapr_core.registration.registrar import NO_POSES, Enough, Registrar, never
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.scene import Scene, Viewpoint
 from gapr_core.results import Refusal
 from gapr_core.runtime.clock import Clock
+from gapr_core.runtime.parallel import single_threaded_libraries
 
 Array = NDArray[np.float64]
 
 
 class PreviousPoses:
-    """Proposes the last pose and its rivals of the last full registration; alone it would count as sure.
-
-    Attributes:
-        poses: (K, 4, 4) T_target_source of the last assessed source, mm, best first.
-        support: share of the hypotheses that came to the pose in the last full registration.
-        place: (3,) mm, frame of the last source: inferred place of its camera; None if none was inferred.
-    """
+    """Proposes the last pose and its rivals of the last full registration; alone it would count as sure."""
 
     name = "track"
 
     def __init__(self) -> None:
-        self.poses: Array = np.empty((0, 4, 4))
-        self.support = 0.0
-        self.place: Array | None = None
+        self.poses: Array = np.empty((0, 4, 4))  # T_target_source of the last assessed source, mm, best first
+        self.support = 0.0  # share of the hypotheses that came to the pose in the last full registration
+        self.place: Array | None = None  # (3,) mm, frame of the last source: inferred place of its camera
 
     def prepare(self, target: PreparedTarget) -> None:
         """Prepare nothing."""
 
-    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
         """Propose the pose first, then its rivals."""
-        return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
+        return self.poses
 
     def keep(self, poses: Sequence[Array]) -> None:
         """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
@@ -67,22 +61,24 @@ class TrackingRegistrar(Registrar):
         super().__init__(full.config, (memory, *full.proposers), full.classifier, full.precision)
         self._full, self._memory = full, memory
 
-    def assess_from(
+    @single_threaded_libraries
+    def assess(
         self,
         source: ArrayLike,
         target: PreparedTarget,
-        start: Array,
-        viewpoint: Viewpoint | None,
-        clock: Clock,
+        start: Array = NO_POSES,
+        viewpoint: Viewpoint | None = None,
+        clock: Clock | None = None,
         enough: Enough = never,
     ) -> Assessment | Refusal:
         """Assess a source; after a source with an inferred camera, as the next view of that camera first."""
+        clock = clock or Clock()
         if viewpoint is None and self._memory.place is not None:
             surface = offset_surface(target, self.config.sensor)
             assessment = self._of_next_view(source, surface, start, clock, enough)
             if assessment is not None:
                 return assessment
-        return super().assess_from(source, target, start, viewpoint, clock, enough)
+        return super().assess(source, target, start, viewpoint, clock, enough)
 
     def _of_next_view(
         self, source: ArrayLike, target: PreparedTarget, start: Array, clock: Clock, enough: Enough

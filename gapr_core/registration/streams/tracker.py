@@ -126,7 +126,7 @@ class Tracker:
 
         Another target than before starts a new track, and so does `initial`.
         """
-        check_call(target, initial)
+        start = check_call(target, initial)
         if target is not self._bone:
             self.reset()
             self._bone = target
@@ -134,7 +134,7 @@ class Tracker:
             self._forget_track()
         self._was_sure, self._is_sure = self._is_sure, False  # and stays so where this source is refused
         clock = Clock()
-        assessment = self._assess(source, target, initial, viewpoint, clock)
+        assessment = self._assess(source, target, start, viewpoint, clock)
         if isinstance(assessment, Assessment):
             assessment = self._with_evidence(assessment, fingerprint(finite_points(source)))
         result = replace(self.registrar.conclude(assessment, clock), method=self.name)
@@ -143,19 +143,14 @@ class Tracker:
         return result
 
     def _assess(
-        self,
-        source: ArrayLike,
-        target: PreparedTarget,
-        initial: ArrayLike | None,
-        viewpoint: Viewpoint | None,
-        clock: Clock,
+        self, source: ArrayLike, target: PreparedTarget, start: Array, viewpoint: Viewpoint | None, clock: Clock
     ) -> Assessment | Refusal:
         """Assess where the last pose was, or in full; a re-check tries the last pose and its rivals too."""
         if not self._has_track:
-            return self.registrar.assess(source, target, initial, viewpoint, clock)
+            return self.registrar.assess(source, target, start, viewpoint, clock)
         if self._since_full + 1 < self.recheck:
             return self._tracking.assess(source, target, viewpoint=viewpoint, clock=clock, enough=self._stands)
-        return self.registrar.assess_from(source, target, self._memory.poses, viewpoint, clock)
+        return self.registrar.assess(source, target, self._memory.poses, viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:
         """Return True for a tracked answer that continues a sure track: other proposers would hardly add to it."""

@@ -36,7 +36,6 @@ from gapr_core.registration.uncertainty.linear_model import (
 
 Array = NDArray[np.float64]
 
-CORRELATION_MM, CENTRES = 20.0, 60  # l of the bias's correlation exp(-d^2 / 2 l^2), and points that span the bias
 SIZES_MM = np.array(
     [0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0]
 )  # standard deviations of the bias to choose from
@@ -53,19 +52,12 @@ NEIGHBOURS = 30, 12  # points of an average for the smooth misfit, and at short 
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """Covariance of a pose, and the misfits that the residuals show.
+    """Covariance of a pose, and the misfits that the residuals show."""
 
-    Attributes:
-        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
-        bias_mm: standard deviation of the smooth bias that the covariance allows for.
-        smooth_mm: smooth misfit of the residuals (see `smooth_misfits_mm`).
-        short_mm: the same at a shorter range, which also holds rougher misfits: another bone's surface.
-    """
-
-    covariance: Array
-    bias_mm: float
-    smooth_mm: float
-    short_mm: float
+    covariance: Array  # (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid
+    bias_mm: float  # standard deviation of the smooth bias that the covariance allows for
+    smooth_mm: float  # smooth misfit of the residuals (see `smooth_misfits_mm`)
+    short_mm: float  # the same at a shorter range, which also holds rougher misfits: another bone's surface
 
     def with_more(self, covariance: Array) -> PoseUncertainty:
         """Add the covariance (6, 6) of a further independent error of the pose."""
@@ -113,8 +105,7 @@ def estimate(
     full = fit.full_fit
     count = int(np.count_nonzero(full.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
-    spanned = fields(full, CORRELATION_MM, CENTRES)
-    equations = equations_of(full, CORRELATION_MM, CENTRES)
+    spanned, equations = fields(full), equations_of(full)
     bias_mm = BIAS_GAIN * expected_bias_mm(equations, known.bias_mm)
     sigma_mm = float(np.sqrt(equations.design_effect)) * full.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, NOISE_POINTS)
@@ -133,8 +124,7 @@ def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | N
 def covariance_added_by(fit: Fit, errors: Array) -> Array:
     """Compute the (6, 6) covariance that independent `errors` (n, k), mm, of the full fit's inliers add."""
     full = fit.full_fit
-    spanned = fields(full, CORRELATION_MM, CENTRES)
-    moved = gain_of(full, spanned, full.sigma_mm)[0] @ errors
+    moved = gain_of(full, fields(full), full.sigma_mm)[0] @ errors
     return _about_middle(fit, moved @ moved.T)
 
 
@@ -170,13 +160,14 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
     """
     inlier = fit.counts
     gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
-    shift, growth = directions(fit, errors.along_beam, ONE_SIDED, eye)
+    shift, growth = directions(fit, errors.along_beam, eye)
+    local = np.zeros((len(inlier), 1)) if errors.local_mm == 0.0 else fields(fit, LOCAL_CORRELATION_MM, LOCAL_CENTRES)
     moved = np.column_stack(
         [
             errors.bias_mm * gain @ bias_fields[inlier],
             LONG_SHARE * errors.bias_mm * gain.sum(axis=1),
             LINEAR_SHARE * errors.bias_mm * gain @ strains(fit),
-            errors.local_mm * gain @ _local_fields(fit, errors)[inlier],
+            errors.local_mm * gain @ local[inlier],
             errors.standoff_mm * gain @ shift,
             config.model_mm * gain.sum(axis=1),
             errors.scale * gain @ growth,
@@ -185,13 +176,13 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
     return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + errors.place_covariance + prior)
 
 
-def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None = None) -> tuple[Array, Array]:
+def directions(fit: Fit, along_beam: bool, eye: Array | None = None) -> tuple[Array, Array]:
     """Compute the changes of the inliers' residuals (n,) by a stand-off of 1 mm and by an error of size.
 
     A stand-off moves every point along its normal. An error of the size of 1 moves it by its distance from the
     centroid, or from a camera with wrong ranges at `eye` (3,), mm, target frame. Where only depths are wrong, both move
     a point along the beam d: by n . d, and by (n . d) times its depth. The beam is the mean normal; where that is
-    shorter than `one_sided`, no beam is common.
+    shorter than `ONE_SIDED`, no beam is common.
     """
     inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
@@ -199,7 +190,7 @@ def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None =
         return np.zeros(0), np.zeros(0)
     away, mean = moved - (moved.mean(axis=0) if eye is None else eye), normals.mean(axis=0)
     length = float(np.linalg.norm(mean))
-    if not along_beam or length < one_sided:
+    if not along_beam or length < ONE_SIDED:
         return np.ones(len(normals)), np.einsum("ni,ni->n", away, normals)
     beam = mean / length
     return normals @ beam, (normals @ beam) * (away @ beam)
@@ -219,12 +210,6 @@ def strains(fit: Fit) -> Array:
     products = np.einsum("ni,nj->nij", normals, (feet - feet.mean(axis=0)) / extent.radius_mm(feet))
     i, j = np.triu_indices(3)
     return np.asarray((products[:, i, j] + products[:, j, i]) / np.where(i == j, 2.0, np.sqrt(2.0)))
-
-
-def _local_fields(fit: Fit, errors: Errors) -> Array:
-    if errors.local_mm == 0.0:
-        return np.zeros((len(fit.moved), 1))
-    return fields(fit, LOCAL_CORRELATION_MM, LOCAL_CENTRES)
 
 
 def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:

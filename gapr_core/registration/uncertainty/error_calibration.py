@@ -27,19 +27,12 @@ SCALE_LIMITS = (0.9, 6.0)  # of a standard deviation: the model may enlarge it, 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """A correction of predicted errors, learned from true ones.
+    """A correction of predicted errors, learned from true ones."""
 
-    Attributes:
-        model: additive model of the log of the scale of a predicted standard deviation.
-        confidences: (K,) ascending confidences of the factors.
-        factors: (K,) bound of 95 % of the true errors, over the predicted 95 % quantile.
-        card: data and fit.
-    """
-
-    model: Additive
-    confidences: tuple[float, ...]
-    factors: tuple[float, ...]
-    card: dict[str, object]
+    model: Additive  # of the log of the scale of a predicted standard deviation
+    confidences: tuple[float, ...]  # (K,) ascending confidences of the factors
+    factors: tuple[float, ...]  # (K,) bound of 95 % of the true errors, over the predicted 95 % quantile
+    card: dict[str, object]  # data and fit
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> Precision:

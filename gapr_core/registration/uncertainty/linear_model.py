@@ -21,6 +21,7 @@ from gapr_core.registration.fit.refinement import Fit
 
 Array = NDArray[np.float64]
 
+CORRELATION_MM, CENTRES = 20.0, 60  # l of the bias's correlation exp(-d^2 / 2 l^2), and points that span the bias
 DESIGN_EFFECTS = np.geomspace(0.25, 20.0, 16)  # to choose from
 EFFECT_SPREAD = 0.7  # log standard deviation of the design effect about 1 before the scores are seen
 BIASES_MM = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0])
@@ -31,22 +32,18 @@ PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be f
 
 
 @lru_cache(maxsize=4)  # covariance, size and bias of one fit share it
-def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
+def fields(fit: Fit, correlation_mm: float = CORRELATION_MM, centres: int = CENTRES) -> Array:
     """Compute (N, m) fields whose products are the bias's correlation between foot points; m inliers span them."""
-    spanned = _spanned(fit.feet, fit.counts, correlation_mm, centres)
+    points, inliers = fit.feet, fit.feet[fit.counts]
+    spanned = np.zeros((len(points), 1))
+    if len(inliers):
+        chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
+        among = smooth_correlation(chosen, chosen, correlation_mm)
+        to_points = smooth_correlation(points, chosen, correlation_mm)
+        root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
+        spanned = to_points @ solve_triangular(root, np.eye(len(chosen)), lower=True).T
     spanned.flags.writeable = False
     return spanned
-
-
-def _spanned(points: Array, inlier: NDArray[np.bool_], correlation_mm: float, centres: int) -> Array:
-    inliers = points[inlier]
-    if not len(inliers):
-        return np.zeros((len(points), 1))
-    chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
-    among = smooth_correlation(chosen, chosen, correlation_mm)
-    to_points = smooth_correlation(points, chosen, correlation_mm)
-    root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
-    return to_points @ solve_triangular(root, np.eye(len(chosen)), lower=True).T
 
 
 def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
@@ -58,19 +55,14 @@ def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Weighted inner products of residuals y, motions J (N, 6) and fields F (N, m) of unit variance.
+    """Weighted inner products of residuals y, motions J (N, 6) and fields F (N, m) of unit variance."""
 
-    Attributes:
-        JJ, JF, FF, Jy, Fy: J^T W J and so on; W is the inverse variance of the points.
-        design_effect: divisor of W, since near points err alike (see `with_design_effect`).
-    """
-
-    JJ: Array
-    JF: Array
-    FF: Array
-    Jy: Array
-    Fy: Array
-    design_effect: float = 1.0
+    JJ: Array  # (6 + k, 6 + k) J^T W J; W is the inverse variance of the points, k the number of further unknowns
+    JF: Array  # (6 + k, m)
+    FF: Array  # (m, m)
+    Jy: Array  # (6 + k,)
+    Fy: Array  # (m,)
+    design_effect: float = 1.0  # divisor of W, since near points err alike (see `with_design_effect`)
 
     @classmethod
     def of(cls, fit: Fit, fields: Array) -> NormalEquations:
@@ -155,9 +147,9 @@ class NormalEquations:
 
 
 @lru_cache(maxsize=4)  # as `fields`
-def equations_of(fit: Fit, correlation_mm: float, centres: int) -> NormalEquations:
+def equations_of(fit: Fit) -> NormalEquations:
     """Build `NormalEquations.of` a fit and its own `fields`, with the design effect of their scores."""
-    equations = NormalEquations.of(fit, fields(fit, correlation_mm, centres))
+    equations = NormalEquations.of(fit, fields(fit))
     if np.count_nonzero(fit.weights) <= UNKNOWNS:  # a motion fits them exactly; the rest is rounding
         return equations
     return equations.with_design_effect(equations.expected_design_effect())

@@ -21,7 +21,6 @@ from gapr_core.registration.uncertainty.linear_model import NormalEquations, equ
 
 Array = NDArray[np.float64]
 
-CORRELATION_MM, CENTRES = 20.0, 60  # l of the correlation exp(-d^2 / 2 l^2), and points that span the bias
 SIZES_MM = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0])  # standard deviations
 EVIDENCE = 2.0  # log likelihood ratio from which a bias is believed
 SMALLEST_SHARE = 0.15  # least information of a usable field, over the largest
@@ -48,8 +47,7 @@ def corrected_fit(
     def at(T: Array) -> Fit:
         return of_points(T) if trust is None else evaluate_trusted(T, source.whole, target, refinement, trust)
 
-    spanned, corrected = fields(before, CORRELATION_MM, CENTRES), before
-    equations = equations_of(before, CORRELATION_MM, CENTRES)
+    spanned, equations, corrected = fields(before), equations_of(before), before
     for number in range(STEPS):
         if number:
             equations = NormalEquations.of(corrected, spanned).with_design_effect(equations.design_effect)

@@ -237,7 +237,7 @@ def examine(network: GAPRNet, pair: Pair, pose: str = METHODS[0]) -> Record:
     found = correspondences_mm(output.matches, source, full)
     agrees_mm = 1.5 * radius_mm
     by_ransac = pose == "ransac"
-    poses = (ransac(found, agrees_mm, np.random.default_rng(0)) if by_ransac else local_to_global(found, agrees_mm))[0]
+    poses = ransac(found, agrees_mm, np.random.default_rng(0)) if by_ransac else local_to_global(found, agrees_mm)
     if not len(poses):
         return record | dict.fromkeys([name for name in FIGURES if "rr_" in name], 0.0)
     best = sharpened(poses[0], found, radius_mm) if by_ransac else poses[0]

@@ -128,7 +128,7 @@ def test_a_method_that_cannot_be_made_stops_the_run(name, error, said, pairs, fa
     with pytest.raises(error, match=said):
         benchmark.benchmark(pairs, [name], tmp_path / "out")
     with pytest.raises(ConfigError, match="gapr_search"):  # settings without a method that has some
-        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(seed=1))
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(num_threads=1))
 
 
 def test_results_of_pairs_of_other_names_are_refused(pairs, fakes, tmp_path, in_process):
@@ -377,22 +377,22 @@ def ours(fakes, monkeypatch):
 def test_settings_reach_our_methods_alone_and_stand_in_records_and_table(pairs, fakes, ours, tmp_path, in_process):
     parser = argparse.ArgumentParser()
     benchmark.add_arguments(parser)
-    (tmp_path / "settings.yaml").write_text("search: {spins: 12}\nseed: 3\n")
+    (tmp_path / "settings.yaml").write_text("search: {spins: 12}\nnum_threads: 3\n")
     words = ["--pairs", pairs, "--methods", f"mine,{fakes('good')[0]}", "--out", tmp_path / "out"]
-    chosen = ["--config", tmp_path / "settings.yaml", "--set", "seed=4"]
+    chosen = ["--config", tmp_path / "settings.yaml", "--set", "num_threads=4"]
     assert benchmark.run(parser.parse_args([str(word) for word in [*words, *chosen]])) == 0
-    assert ours == [RegistrarConfig(search=SearchConfig(spins=12), seed=4)]
+    assert ours == [RegistrarConfig(search=SearchConfig(spins=12), num_threads=4)]
     found = records.read(tmp_path / "out" / records.FILE)
-    assert {r.settings for r in found if r.method == "mine"} == {"search.spins=12, seed=4"}
+    assert {r.settings for r in found if r.method == "mine"} == {"search.spins=12, num_threads=4"}
     assert {r.settings for r in found if r.method != "mine"} == {""}
-    assert "Settings of mine: search.spins=12, seed=4." in (tmp_path / "out" / "table.md").read_text()
+    assert "Settings of mine: search.spins=12, num_threads=4." in (tmp_path / "out" / "table.md").read_text()
 
 
 def test_records_of_other_settings_do_not_pass_for_new_ones(pairs, fakes, ours, tmp_path, in_process):
     benchmark.benchmark(pairs, ["mine"], tmp_path / "out")
     shutil.copytree(tmp_path / "out", tmp_path / "old")
-    other = RegistrarConfig(seed=1)
-    with pytest.raises(ConfigError, match=r"mine with seed=1; got records with the default"):
+    other = RegistrarConfig(num_threads=1)
+    with pytest.raises(ConfigError, match=r"mine with num_threads=1; got records with the default"):
         benchmark.benchmark(pairs, ["mine"], tmp_path / "out", config=other)
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")  # its settings are the same: none
     benchmark.benchmark(pairs, ["mine"], tmp_path / "new", config=other)

@@ -17,7 +17,6 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
 from gapr_core.registration.confidence.features import BONE, FEATURES_OF, SCENE
-from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.results import Hypothesis, Refusal, RegistrationStatus
@@ -38,7 +37,7 @@ class Truth:
 
     def propose(self, source, target, rng):
         self.asked += 1
-        return Proposals(self.pose[None], np.zeros(1))
+        return self.pose[None]
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem import target as targets
-from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
+from gapr_core.registration.proposals import consensus
+from gapr_core.registration.proposals.network import RADIUS_VOXELS, SHIPPED, SMALLEST_VOXEL_MM, NetworkProposer
 
 
 @pytest.fixture(scope="module")
@@ -24,15 +25,21 @@ def pair(toy):
     return sources.prepare(moved), targets.prepare(toy.bone(3000))
 
 
-def proposer(toy, **options):
+def proposer(toy):
     torch.manual_seed(0)
-    return NetworkProposer(GAPRNet(toy.small_config()), **options)
+    return NetworkProposer(GAPRNet(toy.small_config()))
 
 
-def test_proposals_are_rigid_poses_best_first(toy, pair):
-    found = proposer(toy).propose(*pair, np.random.default_rng(0))
-    assert found.poses.shape == (len(found.scores), 4, 4) and len(found.scores) > 1
-    assert (np.diff(found.scores) <= 0).all() and np.allclose(np.linalg.det(found.poses[:, :3, :3]), 1.0)
+def test_proposals_are_rigid_poses_best_first(toy, pair, monkeypatch):
+    one, asked = proposer(toy), []
+    match = one.match
+    monkeypatch.setattr(one, "match", lambda *clouds: asked.append(match(*clouds)) or asked[-1])
+    found = one.propose(*pair, np.random.default_rng(0))
+    assert found.shape == (len(found), 4, 4) and len(found) > 1
+    frame = one.prepare(pair[1])[0]
+    radius_mm = RADIUS_VOXELS * max(SMALLEST_VOXEL_MM, frame.voxel * frame.scale_mm)
+    scores = consensus._support(found, asked[0], radius_mm).sum(axis=1)
+    assert (np.diff(scores) <= 0).all() and np.allclose(np.linalg.det(found[:, :3, :3]), 1.0)
 
 
 def test_the_share_of_the_target_is_computed_once(toy, pair, monkeypatch):
@@ -46,7 +53,7 @@ def test_the_share_of_the_target_is_computed_once(toy, pair, monkeypatch):
         type(one.network.backbone), "forward", lambda self, c: calls.append(len(c.fine.points)) or forward(self, c)
     )
     second = one.propose(pair[0], target, np.random.default_rng(0))
-    assert len(calls) == 1 and np.array_equal(first.poses, second.poses)
+    assert len(calls) == 1 and np.array_equal(first, second)
 
 
 def test_moving_the_source_moves_every_proposal(toy, pair):
@@ -54,7 +61,7 @@ def test_moving_the_source_moves_every_proposal(toy, pair):
     moved = sources.prepare(se3.apply(T, pair[0].points))
     one = proposer(toy)
     still, after = (one.propose(s, pair[1], np.random.default_rng(0)) for s in (pair[0], moved))
-    shift, turn = se3.pose_error(after.poses[0] @ T, still.poses[0], pair[0].points)
+    shift, turn = se3.pose_error(after[0] @ T, still[0], pair[0].points)
     assert shift < 0.05 and turn < 0.05
 
 
@@ -63,7 +70,7 @@ def test_the_network_sees_all_points_of_which_some_are_fitted(toy, pair):
     part = sources.prepare(all_points, SourceConfig(fitted_points=400))
     assert part.is_part and len(part.points) <= 400
     found, expected = (one.propose(each, pair[1], np.random.default_rng(0)) for each in (part, pair[0]))
-    assert np.array_equal(found.poses, expected.poses)
+    assert np.array_equal(found, expected)
 
 
 def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
@@ -73,7 +80,7 @@ def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
         p.propose(*pair, np.random.default_rng(0))
         for p in (one, NetworkProposer.from_weights(tmp_path / "w.safetensors"))
     )
-    assert np.array_equal(first.poses, second.poses)
+    assert np.array_equal(first, second)
 
 
 def test_of_other_weights_than_the_shipped_ones_it_is_said_that_no_confidence_was_fitted_to_them(toy, tmp_path, caplog):

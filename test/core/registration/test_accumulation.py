@@ -10,12 +10,11 @@ from gapr_core.config import SensorConfig
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
-from gapr_core.geometry import se3
+from gapr_core.geometry import se3, twists
 from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
+from gapr_core.registration.checks.unknowns import Shown
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.streams import accumulator as accumulators
-from gapr_core.registration.streams import motion_test as creep
-from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis, RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
@@ -409,9 +408,9 @@ def test_a_motion_that_is_hardly_excluded_widens_the_bound_and_a_sure_one_refuse
     creeping, monkeypatch, log_ratio, count, is_wider, is_refused
 ):
     """Of two sources nobody knows."""
-    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Shown(0.0, 4.0)))
+    monkeypatch.setattr(accumulators, "of_motion", lambda *_: (Shown(0.0, 4.0), None))
     _, at_rest = creeping(0.0, count)
-    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Shown(log_ratio, 4.0)))
+    monkeypatch.setattr(accumulators, "of_motion", lambda *_: (Shown(log_ratio, 4.0), None))
     accumulator, result = creeping(0.0, count)
     assert ("the bone moves against the frame" in result.reason) is is_refused and result.ok is not is_refused
     assert is_refused or (result.tre95_mm > at_rest.tre95_mm + 2.0) is is_wider
@@ -419,9 +418,9 @@ def test_a_motion_that_is_hardly_excluded_widens_the_bound_and_a_sure_one_refuse
 
 
 def test_what_the_bone_may_have_moved_by_is_in_the_covariance(creeping, quick, target, monkeypatch):
-    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Shown(0.9, 4.0)))
+    monkeypatch.setattr(accumulators, "of_motion", lambda *_: (Shown(0.9, 4.0), None))
     _, at_rest = creeping(0.0)
-    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Shown(1.1, 4.0)))
+    monkeypatch.setattr(accumulators, "of_motion", lambda *_: (Shown(1.1, 4.0), None))
     _, result = creeping(0.0)
     motion = np.diag([2.0**2] * 3 + [0.02**2] * 3)
     about = np.array([30.0, -10.0, 5.0])
@@ -431,7 +430,7 @@ def test_what_the_bone_may_have_moved_by_is_in_the_covariance(creeping, quick, t
     assert np.linalg.eigvalsh(added).min() > -1e-9 and np.diag(added)[:3].min() >= 0.99 * 2.0**2
     assert np.array_equal(result.T_target_source, at_rest.T_target_source)
     assert result.tre_mm == pytest.approx(predicted_rmse_mm(result.covariance, target.points, result.centre_mm))
-    bound_mm = precision.bound_mm(result.covariance, target.points, result.centre_mm)
+    bound_mm = twists.bound_mm(result.covariance, target.points, result.centre_mm)
     assert result.tre95_mm == pytest.approx(result.factor95 * bound_mm) and result.tre95_mm > at_rest.tre95_mm + 2.0
     exact = Registrar(replace(quick.config, max_tre_mm=3.0), quick.proposers, quick.classifier)
     _, refused = creeping(0.0, method=exact)

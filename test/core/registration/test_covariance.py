@@ -41,8 +41,7 @@ def curved_fit(count=300, sigma_mm=0.5, bias_mm=0.0, seed=0):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     weights = np.where(rng.random(count) < 0.1, 0.0, rng.uniform(0.5, 1.0, count))
     points = np.stack([x, y, z], axis=1) + [100.0, -30.0, 5.0]
-    elements = np.zeros(count, dtype=np.int64)
-    return refinement.Fit(np.eye(4), sigma_mm, np.zeros(count), weights, normals, elements, points, bias_mm)
+    return refinement.Fit(np.eye(4), sigma_mm, np.zeros(count), weights, normals, points, bias_mm)
 
 
 def solved(fit, errors_mm, noise_mm, fields):
@@ -70,7 +69,7 @@ def drawn(kind, fit, rng, count=4000):
     if kind == "beam scale":  # a point moves along the beam by its depth
         depth = (points - points[inlier].mean(axis=0)) @ beam_of(fit)
         return rng.normal(size=(count, 1)) * depth * (fit.gradients @ beam_of(fit))
-    length_mm = covariance.LOCAL_CORRELATION_MM if kind == "local_mm" else covariance.CORRELATION_MM
+    length_mm = covariance.LOCAL_CORRELATION_MM if kind == "local_mm" else bias_field.CORRELATION_MM
     correlation = bias_field.smooth_correlation(points, points, length_mm)
     return rng.multivariate_normal(np.zeros(len(points)), correlation, count, method="eigh")
 
@@ -96,7 +95,7 @@ def test_each_error_spreads_the_pose_as_its_term_says(known, kind, size, correct
     known(long_share=0.0, linear_share=0.0)
     fit = curved_fit(bias_mm=corrected_mm)
     noise_mm = size if kind == "noise_mm" else 0.5
-    fields = bias_field.fields(fit, covariance.CORRELATION_MM, 80)
+    fields = bias_field.fields(fit, centres=80)
     twists = solved(fit, size * drawn(kind, fit, np.random.default_rng(1)), noise_mm, fields) * arms(fit)
     along_beam, name = kind.startswith("beam"), kind.removeprefix("beam ")
     errors = replace(NOTHING, along_beam=along_beam, **{"noise_mm": noise_mm, name: size})
@@ -112,7 +111,7 @@ def test_each_error_spreads_the_pose_as_its_term_says(known, kind, size, correct
 def test_noise_counts_by_the_weights_of_the_fit():
     """Of two points that say the same, one of weight 1 and one of weight 1/2, least squares takes 2 to 1."""
     fit = curved_fit()
-    fields = bias_field.fields(fit, covariance.CORRELATION_MM, 80)
+    fields = bias_field.fields(fit, centres=80)
     gain, _ = covariance.gain_of(fit, fields, 0.5)
     inlier = fit.weights > 0.0
     even, _ = covariance.gain_of(replace(fit, weights=np.where(inlier, 1.0, 0.0)), fields, 0.5)
@@ -136,7 +135,7 @@ def test_all_points_that_a_pose_rests_on_make_its_covariance():
     """50 of 300 points are fitted: the covariance is that of the 300, said about the centroid of the 50."""
     whole = replace(curved_fit(), signed_mm=np.random.default_rng(0).normal(0.0, 0.5, 300))
     some = np.arange(50)
-    part = {name: getattr(whole, name)[some] for name in ("signed_mm", "weights", "gradients", "elements", "moved")}
+    part = {name: getattr(whole, name)[some] for name in ("signed_mm", "weights", "gradients", "moved")}
     fit = replace(whole, **part)
     of_part, of_all = (covariance.estimate(each, CONFIG) for each in (fit, whole))
     found = covariance.estimate(replace(fit, whole=whole), CONFIG)
@@ -169,7 +168,7 @@ def test_ranges_that_are_wrong_move_the_whole_cloud_along_the_line_of_sight(far_
     fit, errors, fields = curved_fit(), replace(NOTHING, scale=0.01), np.zeros((300, 1))
     inlier, sight = fit.weights > 0.0, np.array([0.6, 0.0, 0.8])
     eye = fit.moved[inlier].mean(axis=0) - far_mm * sight
-    of_size, of_ranges = (covariance.directions(fit, False, 0.3, *where)[1] for where in ((), (eye,)))
+    of_size, of_ranges = (covariance.directions(fit, False, *where)[1] for where in ((), (eye,)))
     np.testing.assert_allclose(of_ranges - of_size, fit.gradients[inlier] @ (far_mm * sight), atol=1e-9)
     alone, found = (covariance.sandwich(fit, fields, errors, CONFIG, *where) for where in ((), (eye,)))
     assert np.sqrt(np.trace(alone[:3, :3])) < 0.4
@@ -189,12 +188,12 @@ def test_only_a_stated_scale_is_one_of_the_ranges_from_where_a_camera_was():
 def test_a_view_from_several_sides_has_no_beam():
     fit = curved_fit()
     both_ways = replace(fit, gradients=fit.gradients * np.where(np.arange(300) % 2, 1.0, -0.9)[:, None])
-    seen = [covariance.directions(both_ways, along_beam, 0.3) for along_beam in (True, False)]
+    seen = [covariance.directions(both_ways, along_beam) for along_beam in (True, False)]
     for ours, usual in zip(*seen, strict=True):
         np.testing.assert_array_equal(ours, usual)
-    beam, usual = (covariance.directions(fit, along_beam, 0.3)[0] for along_beam in (True, False))
+    beam, usual = (covariance.directions(fit, along_beam)[0] for along_beam in (True, False))
     assert np.abs(beam - usual).max() > 0.1
-    assert covariance.directions(replace(fit, weights=np.zeros(300)), True, 0.3)[0].shape == (0,)
+    assert covariance.directions(replace(fit, weights=np.zeros(300)), True)[0].shape == (0,)
 
 
 def test_what_the_bias_has_in_common_is_a_standoff_of_its_own(known):
@@ -239,7 +238,7 @@ def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by(known):
     """As strains in proportion to the bias do, about the middle of the points that were compared."""
     fit = curved_fit()
     errors = replace(NOTHING, bias_mm=0.8)
-    fields = covariance.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
+    fields = bias_field.fields(fit)
     spread = []
     for share in (0.7, 0.0):
         known(long_share=0.0, linear_share=share)
@@ -248,7 +247,7 @@ def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by(known):
     found = covariance.covariance_added_by(fit, 0.56 * covariance.strains(fit))
     np.testing.assert_allclose(found, strained - rigid, rtol=1e-6, atol=1e-9)
     some = np.arange(300) < 200
-    of_some = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
+    of_some = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.moved))
     drawn = refinement.Fit(fit.T, fit.sigma_mm, *of_some, whole=fit)
     about = drawn.moved.mean(axis=0) - fit.moved.mean(axis=0)
     same = covariance.covariance_added_by(drawn, 0.56 * covariance.strains(fit))
@@ -270,7 +269,7 @@ def test_the_bias_is_as_large_as_the_residuals_say(size_mm):
     for seed in range(6):
         fit = curved_fit(2500, sigma_mm=0.4, seed=seed)
         rng = np.random.default_rng(100 + seed)
-        fields = bias_field.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
+        fields = bias_field.fields(fit)
         signed = size_mm * fields @ rng.normal(size=fields.shape[1]) + rng.normal(size=2500) * 0.4
         fit = replace(fit, signed_mm=signed)
         equations = bias_field.NormalEquations.of(fit, fields)
@@ -398,7 +397,7 @@ def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target, kn
 
 def test_a_share_of_the_bias_moves_all_points_together(known):
     fit = curved_fit(400)
-    fields = bias_field.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
+    fields = bias_field.fields(fit)
     noise = np.random.default_rng(0).normal(0.0, 0.5, 400)
     fit = replace(fit, signed_mm=0.6 * fields @ np.random.default_rng(1).normal(size=fields.shape[1]) + noise)
     found = []
@@ -406,7 +405,7 @@ def test_a_share_of_the_bias_moves_all_points_together(known):
         known(long_share=share)
         found.append(covariance.estimate(fit, CONFIG))
     without, with_it = found
-    effect = bias_field.equations_of(fit, covariance.CORRELATION_MM, covariance.CENTRES).design_effect
+    effect = bias_field.equations_of(fit).design_effect
     sigma_mm = np.sqrt(effect) * 0.5
     noise_mm = covariance.expected_noise_mm(sigma_mm, np.count_nonzero(fit.weights), 0.5, covariance.NOISE_POINTS)
     together = covariance.gain_of(fit, fields, noise_mm)[0].sum(axis=1)
@@ -426,7 +425,7 @@ def test_points_that_err_alike_make_the_noise_of_the_pose_larger(known):
         signed = np.empty(2000)
         signed[near] = np.repeat(rng.normal(0.0, 0.5, 2000 // clump), clump)
         alike = replace(fit, signed_mm=signed, moved=fit.moved + signed[:, None] * fit.gradients)
-        effects.append(bias_field.equations_of(alike, covariance.CORRELATION_MM, covariance.CENTRES).design_effect)
+        effects.append(bias_field.equations_of(alike).design_effect)
         sizes.append(np.trace(covariance.estimate(alike, CONFIG, sensor).covariance[:3, :3]))
     assert effects[1] > 2.0 * effects[0]
     assert sizes[1] / sizes[0] == pytest.approx(effects[1] / effects[0], rel=0.05)
@@ -436,7 +435,7 @@ def test_what_was_not_observed_is_uncertain_and_not_exact():
     """Of a plane: the slides and the spin are not known at all, and across it only its stand-off is not."""
     points = np.column_stack([np.random.default_rng(1).uniform(-30.0, 30.0, (500, 2)), np.zeros(500)])
     up, signed = np.tile([0.0, 0.0, 1.0], (500, 1)), np.random.default_rng(2).normal(0.0, 0.2, 500)
-    fit = refinement.Fit(np.eye(4), 0.2, signed, np.ones(500), up, np.zeros(500, dtype=np.int64), points)
+    fit = refinement.Fit(np.eye(4), 0.2, signed, np.ones(500), up, points)
     for weights in (np.ones(500), np.zeros(500)):
         found = covariance.estimate(replace(fit, weights=weights), CovarianceConfig())
         assert found.largest_shift_mm > 100.0 and found.largest_turn_deg > 100.0

@@ -30,7 +30,7 @@ target, source = targets.prepare(points), sources.prepare(points[points[:, 2] > 
 proposer = {"network": pretrained_network, "search": lambda: NormalAlignedSearch(config.search, 2)}[sys.argv[1]]()
 
 def register():
-    poses = proposer.propose(source, target, np.random.default_rng(0)).poses
+    poses = proposer.propose(source, target, np.random.default_rng(0))
     best = verify(poses, source, target, config.verification, 2).poses[0]
     return refine_fully(best, source.points, target, config.refinement, source.neighbours).T
 

@@ -7,13 +7,12 @@ import pytest
 
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import SensorConfig
-from gapr_core.geometry import se3
+from gapr_core.geometry import se3, twists
 from gapr_core.registration import guidance
 from gapr_core.registration.confidence.classifier import Judgement
 from gapr_core.registration.guidance import guide, information
 from gapr_core.registration.problem import target as targets
 from gapr_core.registration.problem.sensor import offset_surface
-from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis
 
 DOUBTFUL = Judgement(float(np.log(0.4 / 0.6)), 3.0)
@@ -85,7 +84,7 @@ def test_the_expected_bound_is_that_of_the_updated_covariance(distal):
     noise_mm, bias_mm = max(distal.fit.sigma_mm, guidance.NOISE_MM), max(distal.uncertainty.bias_mm, guidance.BIAS_MM)
     after = np.linalg.inv(distal.uncertainty.covariance)
     after = np.linalg.inv(after + information(J, guidance.LOOK_POINTS, noise_mm, bias_mm))
-    bound_mm = precision.bound_mm(after, target.points[target.anchors], centre)
+    bound_mm = twists.bound_mm(after, target.points[target.anchors], centre)
     over_all = distal.tre95_mm / distal.bound_mm(target.points[target.anchors])
     assert patch.tre95_mm == pytest.approx(over_all * distal.factor95 * bound_mm)
 

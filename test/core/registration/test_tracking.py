@@ -10,7 +10,6 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.streams import tracker as trackers
 from gapr_core.registration.streams.evidence import fingerprint, is_repeated
 from gapr_core.registration.streams.memory import PreviousPoses
@@ -157,13 +156,13 @@ def test_every_so_many_sources_one_is_registered_in_full(registrar, frames, prep
 
 
 def test_a_full_registration_weighs_the_last_pose_and_its_rivals(registrar, frames, prepared, monkeypatch):
-    tracker, begun, assess_from = Tracker(registrar, recheck=2), [], Registrar.assess_from
+    tracker, begun, assess = Tracker(registrar, recheck=2), [], Registrar.assess
 
     def recorded(self, source, target, start, *rest):
         begun.append(start)
-        return assess_from(self, source, target, start, *rest)
+        return assess(self, source, target, start, *rest)
 
-    monkeypatch.setattr(Registrar, "assess_from", recorded)
+    monkeypatch.setattr(Registrar, "assess", recorded)
     for pair in frames[:2]:
         tracker.register(pair.source, prepared)
     remembered = tracker._memory.poses
@@ -199,7 +198,7 @@ def test_a_pose_without_rivals_is_not_followed(frames, prepared, believing):
             pass
 
         def propose(self, source, target, rng):
-            return Proposals(frames[0].T_target_source[None], np.ones(1))
+            return frames[0].T_target_source[None]
 
     tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), [Truth()], believing(0.9)))
     assert tracker.register(frames[0].source, prepared).ok

@@ -43,9 +43,8 @@ class TrainConfig(Settings):
     warmup: float = setting(0.02, "share of the schedule with a rising learning rate", low=0, high=1)
     final_rate: float = setting(0.01, "learning rate at the end of the cosine over that at its start", low=0, high=1)
     ema: float = setting(0.995, "decay of the averaged weights, which are validated and exported", low=0, high=1)
-    coarse_first: float = setting(
-        0.0, "share of the schedule, its first part, with 0.6 of the superpoints, at half the cost", low=0, high=1
-    )
+    coarse_first: float = setting(0.0, "share of the schedule, its first part, with fewer superpoints", low=0, high=1)
+    coarse_size: float = setting(0.6, "share of the superpoints in that part; 0.6 costs half", low=0.01, high=1)
     pool: int = setting(128, "bones in use at once", low=1)
     reuse: int = setting(16, "pairs that a bone serves before the next subject comes in", low=1)
     share: int = setting(2, "neighbouring pairs with one target, whose features are computed once", low=1)

@@ -31,6 +31,7 @@ from gapr_core.training.targets import TrainingPair, join, training_pair
 Array = NDArray[np.float64]
 CROPPED = ("paper", "overlap", "incomplete")  # protocols (beginnings) that crop a cloud
 OWN_TARGET = ("incomplete",)  # protocols whose target is not the whole bone
+COARSE = 0.6  # of the superpoints, in the first part of a schedule with `coarse_first`
 LANES = 4  # the bone of a pair and its micro-batch have numbers that are the same modulo this
 
 
@@ -152,7 +153,7 @@ class TrainingPairs(Dataset[TrainingPair]):
         """Return the network's settings for this bone: fewer superpoints for bones that come in first."""
         if bone // LANES * LANES * self.train.reuse >= self.train.coarse_first * self.train.pairs:
             return self.model
-        few, many = (max(4, round(self.train.coarse_size * count)) for count in self.model.superpoints)
+        few, many = (max(4, round(COARSE * count)) for count in self.model.superpoints)
         return replace(self.model, superpoints=(few, many))
 
     def _prepare(self, made: Pair, bone: PooledBone, model: ModelConfig) -> TrainingPair:

@@ -74,14 +74,13 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
         assert gap.median() < 0.1 and pair.overlaps.max() > 0.3
 
 
-@pytest.mark.parametrize(("size", "most"), [(0.6, 0.8), (0.3, 0.45)])
-def test_the_first_part_of_a_schedule_can_see_coarse_clouds(settings, anatomy, size, most):
+def test_the_first_part_of_a_schedule_can_see_coarse_clouds(settings, anatomy):
     """The bones that come in first have fewer superpoints, those after them as many as ever."""
-    train = replace(settings, mix={"incomplete": 1.0}, pairs=1000, coarse_first=0.5, coarse_size=size)
+    train = replace(settings, mix={"incomplete": 1.0}, pairs=1000, coarse_first=0.5)
     model = replace(settings.network(), superpoints=(40, 60))
     pairs, plain = (TrainingPairs(of, model, anatomy) for of in (train, replace(train, coarse_first=0.0)))
     early, late = ([len(of.pair(n).target.coarse.points) for of in (pairs, plain)] for n in (0, 990))
-    assert early[0] < most * early[1] and late[0] == late[1]
+    assert early[0] < 0.8 * early[1] and late[0] == late[1]
 
 
 @pytest.mark.parametrize("pool", [3, 8, 128])

@@ -122,7 +122,7 @@ def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str
         models[kind] = fit(answers.of(known_families(answers)))
         confidence = confidences(found["subjects"])
         chosen = (confidence >= ACCEPTED) & ~answers.refused & of_own_bone(answers) & answers.right
-        accepted.append((answers.of(chosen).with_features(SHARED), confidence[chosen]))
+        accepted.append((answers.of(chosen).with_features(tuple(SHARED)), confidence[chosen]))
     rho_pose, rho_bone = streams.correlations(records)
     pose, bone = ({kind: as_dict(getattr(each, name)) for kind, each in models.items()} for name in Models._fields)
     data = {"pose": pose, "bone": bone, "rho_pose": rho_pose, "rho_bone": rho_bone}

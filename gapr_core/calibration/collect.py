@@ -199,8 +199,8 @@ def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Genera
     turn = np.radians(rng.uniform(0.0, STEP_DEG)) * random_directions(1, rng)[0]
     shift = rng.uniform(0.0, STEP_MM) * random_directions(1, rng)[0]
     memory = PreviousPoses()
-    memory.keep([hypothesis.T_target_source for hypothesis in hypotheses])
-    memory.poses = memory.poses @ se3.exp(np.concatenate([shift, turn]), source.mean(axis=0))
+    poses = np.stack([hypothesis.T_target_source for hypothesis in hypotheses])
+    memory.poses = poses @ se3.exp(np.concatenate([shift, turn]), source.mean(axis=0))
     if rng.random() < FORGOTTEN and len(memory.poses) > 2:
         memory.poses = memory.poses[1:]
     return replace(pair, source=source), memory

@@ -27,7 +27,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks import image, table
-from gapr_core.registration.checks.assess import assess_fit, bias_corrected, follows_both_cortices
+from gapr_core.registration.checks.assess import assess_fit, bias_corrected, with_both_cortices
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.conclude import conclude, unit_question
 from gapr_core.registration.checks.deformation import deformation
@@ -218,11 +218,10 @@ class Registrar:
     ) -> Assessment | None:
         """Register a source of which all points may be bone, to both cortices where it follows both."""
         assessment = self._in_rounds(source, target, poses, clock, enough)
-        if assessment is None or not follows_both_cortices(assessment, self.config):
+        both = None if assessment is None else with_both_cortices(assessment, self.config)
+        if assessment is None or both is None:
             return assessment
-        both = assessment.target.both_cortices
-        again = None if both is None else self._in_rounds(source, both, assessment.fit.T[None], clock)
-        return again or assessment
+        return self._in_rounds(source, both, assessment.fit.T[None], clock) or assessment
 
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never

@@ -117,12 +117,13 @@ class RegistrationResult:
         """As `ok`: a refusal is no pose."""
         return self.ok
 
-    def refused(self, status: RegistrationStatus, reason: str) -> RegistrationResult:
-        """Return the refusal: no pose and nothing that needs one; confidence and hypotheses stay."""
+    def refused(self, finding: Finding) -> RegistrationResult:
+        """Return the refusal by a finding: no pose and nothing that needs one; confidence and hypotheses stay."""
         return replace(
             self,
-            status=status,
-            reason=reason,
+            status=finding.status,
+            reason=str(finding),
+            findings=(*self.findings, finding),
             T_target_source=None,
             covariance=None,
             centre_mm=None,

@@ -78,7 +78,7 @@ def main(description: str, checkout: type[Checkout], teacher: Teacher) -> int:
     parser = ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--checkout", type=Path, required=True, help="folder of the authors' code")
     parser.add_argument(
-        "--config", type=Path, default=Path("config/train_paper.yaml"), help="of the pairs, the schedule and the sizes"
+        "--config", type=Path, default=Path("config/ablate_paper.yaml"), help="of the pairs, the schedule and the sizes"
     )
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--pairs", type=int, required=True, help="budget")

@@ -155,11 +155,11 @@ def test_only_the_refusal_of_an_improbable_pose_of_bone_alone_asks_for_the_stand
 
 def test_a_degenerate_refusal_asks_for_the_unit(a):
     degenerate = replace(REFUSED, status=RegistrationStatus.DEGENERATE)
-    small = replace(a, source=replace(a.source, points=a.source.points / 10.0)).with_finding(degenerate)
-    reason = conclude(small, CONFIG).reason
+    tenth = replace(a, source=replace(a.source, points=a.source.points / 10.0))
+    reason = conclude(tenth.with_finding(degenerate), CONFIG).reason
     assert reason.startswith("another pose fits; look elsewhere; the cloud is 7.33 mm across")
     assert reason.endswith(": is the cloud in cm?")
-    assert "is the cloud" not in conclude(small.with_finding(None), CONFIG, CLUTTER).reason
+    assert "is the cloud" not in conclude(tenth, CONFIG, CLUTTER).reason
     assert "is the cloud" not in conclude(a.with_finding(degenerate), CONFIG).reason
 
 

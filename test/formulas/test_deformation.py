@@ -11,11 +11,11 @@ from gapr_core.geometry import se3
 from gapr_core.registration.checks import deformation as deformations
 from gapr_core.registration.checks.deformation import (
     LIMITS,
+    STEPS,
     TEXTS,
     deformation,
     of_deformations,
     of_motion,
-    step_times,
     with_looks,
 )
 from gapr_core.registration.checks.unknowns import (
@@ -376,10 +376,9 @@ def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first, rests
 def test_a_step_is_as_large_as_what_moved_and_may_have_been_between_any_two_groups(seen):
     points, normals, order = drawn_along(seen)
     fit = fit_of(points, normals, noise(2400) + np.where(order < 4, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0])
-    steps = step_times(6)
-    np.testing.assert_allclose(12.0 * steps, [2.0, 4.0, 6.0, 8.0, 10.0, 11.0])
-    change = (order / 11.0 >= steps[1])[:, None] * motions(fit)
-    (same,) = shown(blocks(fit, fit.jacobian, [change], np.searchsorted(steps, order / 11.0, "right")))
+    np.testing.assert_allclose(12.0 * STEPS, [2.0, 4.0, 6.0, 8.0, 10.0, 11.0])
+    change = (order / 11.0 >= STEPS[1])[:, None] * motions(fit)
+    (same,) = shown(blocks(fit, fit.jacobian, [change], np.searchsorted(STEPS, order / 11.0, "right")))
     found = of_motion(fit, order)[0]
     assert found.size_mm == pytest.approx(same.size_mm, rel=1e-6)
     assert found.log_ratio == pytest.approx(same.log_ratio - np.log(6.0))

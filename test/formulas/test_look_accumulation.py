@@ -10,7 +10,7 @@ from gapr_core import ConfigError, InvalidPointCloudError, LookAccumulator, Regi
 from gapr_core.geometry import se3
 from gapr_core.registration.scenes.scene import Look
 from gapr_core.registration.streams.look_accumulator import STUCK
-from gapr_core.results import LookAnswer, LookFit, RegistrationResult, RegistrationStatus
+from gapr_core.results import Effect, LookAnswer, LookFit, RegistrationResult, RegistrationStatus
 
 OK = RegistrationResult(RegistrationStatus.OK, np.eye(4))
 REFUSED = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="too little bone")
@@ -273,6 +273,7 @@ def test_a_newest_look_that_alone_has_another_pose_is_refused(target, x_mm, deg,
     assert result.ok is not is_refused and names(looks.collected) == ([0] if is_refused else [0, 1])
     if is_refused:
         assert "newest look alone has another pose" in result.reason
+        assert [(each.check, each.effect) for each in result.findings] == [("newest look", Effect.REFUSE)]
 
 
 def test_a_first_look_is_not_compared_with_itself(target):

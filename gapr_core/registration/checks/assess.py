@@ -59,18 +59,18 @@ def checked_geometry(a: Assessment, config: RegistrarConfig) -> Assessment:
     return table.flat_valley(a, config) if a.reaches(config.worth_checking) else a
 
 
-def follows_both_cortices(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """Return True where the inner cortex of a hollow bone explains the residuals, down to the noise of the source.
+def with_both_cortices(assessment: Assessment, config: RegistrarConfig) -> PreparedTarget | None:
+    """Return a hollow bone whose inner cortex explains the residuals, down to the noise of the source; else None.
 
     No probe sees the inner cortex, but a source cut out of such a model follows both. Two nearby sheets shrink the
     residuals of any bad fit; only a source that lies on both leaves nothing but its noise.
     """
     both = assessment.target.both_cortices
     if both is None:
-        return False
+        return None
     sigma_mm = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement).sigma_mm
     noise_mm = max(float(np.median(assessment.source.flatness_mm)), config.refinement.smallest_sigma_mm)
-    return sigma_mm < BOTH_SHARE * assessment.fit.sigma_mm and sigma_mm < BOTH_NOISE * noise_mm
+    return both if sigma_mm < BOTH_SHARE * assessment.fit.sigma_mm and sigma_mm < BOTH_NOISE * noise_mm else None
 
 
 def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessment:

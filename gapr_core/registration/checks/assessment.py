@@ -102,10 +102,8 @@ class Assessment:
         """Return True when no finding refuses the pose and its confidence reaches `limit`."""
         return self.refusal is None and self.confidence >= limit
 
-    def with_finding(self, finding: Finding | None, added: Array | None = None) -> Assessment:
-        """Add a finding, if any; `added` (6, 6) joins the covariance of one that widens it."""
-        if finding is None:
-            return self
+    def with_finding(self, finding: Finding, added: Array | None = None) -> Assessment:
+        """Add a finding; `added` (6, 6) joins the covariance of one that widens it."""
         wider = self.uncertainty if added is None else self.uncertainty.with_more(added)
         return replace(self, findings=(*self.findings, finding), uncertainty=wider)
 

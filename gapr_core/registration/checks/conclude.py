@@ -6,7 +6,6 @@ that is mostly not bone, and the questions of a refusal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -70,9 +69,9 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
             factor95=a.factor95,
             centre_mm=a.centre_mm,
         )
-    asked = questions(a, refusal, config)
-    reason = "; ".join(filter(None, (refusal.text, refusal.advice, *(each.text for each in asked))))
-    return replace(common, status=refusal.status, reason=reason, findings=(*findings, *asked))
+    asked = question(a, refusal, config)
+    reason = "; ".join(filter(None, (refusal.text, refusal.advice, asked and asked.text)))
+    return replace(common, status=refusal.status, reason=reason, findings=(*findings, asked) if asked else findings)
 
 
 def by_threshold(
@@ -94,15 +93,13 @@ def by_threshold(
     return None
 
 
-def questions(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Sequence[Finding]:
+def question(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Finding | None:
     """Ask whether the unit, or the stand-off, of a refused source is right."""
     if refusal.status is RegistrationStatus.DEGENERATE:
-        asked = unit_question(a.source.points, a.target.points)
-    elif refusal.status is RegistrationStatus.LOW_CONFIDENCE and a.seen is None:
-        asked = standoff_question(a, config)
-    else:
-        asked = None
-    return () if asked is None else (asked,)
+        return unit_question(a.source.points, a.target.points)
+    if refusal.status is RegistrationStatus.LOW_CONFIDENCE and a.seen is None:
+        return standoff_question(a, config)
+    return None
 
 
 def unit_question(source: Array, target: Array) -> Finding | None:

@@ -26,7 +26,8 @@ TEXTS = {
     "layered": "the distance from the bone changes along the source, as under tissue",
 }
 ADVICE = "check that nothing moved during the measurement, and bare the bone"
-GROUPS = 6  # groups of sources in time, averaged apart
+# times between six groups of sources, averaged apart, as shares: the last group is halved, as the newest matter most
+STEPS = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 5.5]) / 6.0
 
 
 def deformation(fit: Fit) -> tuple[Finding, Array] | None:
@@ -119,22 +120,16 @@ def of_motion(fit: Fit, order: NDArray[np.int64]) -> tuple[Shown, int | None]:
     if np.count_nonzero(inlier) < FEWEST_POINTS or not order.max() > order.min():
         return NOTHING, None
     time = ((order - order.min()) / (order.max() - order.min()))[inlier]
-    steps = step_times(GROUPS)
-    group = np.searchsorted(steps, time, side="right")
+    group = np.searchsorted(STEPS, time, side="right")
     moved = motions(fit)
-    changes = [when[:, None] * moved for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
+    changes = [when[:, None] * moved for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in STEPS)]]
     evidence = shown(blocks(fit, fit.jacobian[inlier], changes, group))
-    any_of_steps = np.log(len(steps))  # all are equally likely before the residuals
+    any_of_steps = np.log(len(STEPS))  # all are equally likely before the residuals
     ratios = [evidence[0].log_ratio, *(each.log_ratio - any_of_steps for each in evidence[1:])]
     best = int(np.argmax(ratios))
     if best == 0:
         return evidence[0], None
     # a step in the first half of a group is found at the edge before it
-    at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()
+    at = 0.5 * np.append(STEPS, 1.0)[best - 1 : best + 1].sum()
     rests_from = int(np.ceil(order.min() + at * (order.max() - order.min())))
     return Shown(ratios[best], evidence[best].size_mm), rests_from
-
-
-def step_times(groups: int) -> Array:
-    """Compute (groups,) times between groups, as shares: equal ones, the last halved, as the newest matter most."""
-    return np.append(np.arange(1, groups), groups - 0.5) / groups

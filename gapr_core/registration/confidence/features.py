@@ -23,50 +23,42 @@ from gapr_core.registration.uncertainty.linear_model import equations_of, fields
 Array = NDArray[np.float64]
 
 BONE, SCENE = "bone", "scene"  # kinds of answers: a source that is bone alone, a part of a camera's cloud
-SHARED = (
-    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "rough_misfit", "inlier_ratio", "support",
-    "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", "scale_z", "scale_off", "log_scale_sd",
-    "size_margin", "near_size_margin", "mirror_margin",
-)  # fmt: skip
-FEATURES_OF = {
-    BONE: (*SHARED, "residual", "margin", "log_hypotheses"),
-    SCENE: (*SHARED, "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared",
-            "rival_margin"),
-}  # fmt: skip
-SIGNS = {
-    "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "rough_misfit": -1, "inlier_ratio": 1, "support": 1,
-    "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1,
-    "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "log_hypotheses": 1, "free_space_score": 1,
-    "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
-}  # fmt: skip  # +1: larger values can only raise the probability, -1: only lower it
-FEATURE_LABELS = {
-    "log_sigma": "size of the residuals",
-    "log_excess": "residuals against the noise of the source",
-    "smooth_misfit": "smooth misfit to the bone, long range",
-    "short_misfit": "smooth misfit to the bone, short range",
-    "inlier_ratio": "share of the points that fit",
-    "residual": "residual of the best hypothesis before refinement",
-    "margin": "lead over the next hypothesis",
-    "log_hypotheses": "number of hypotheses that competed",
-    "support": "share of the attempts that ended here",
-    "log_shift_sd": "uncertainty of the position",
-    "log_turn_sd": "uncertainty of the rotation",
-    "normal_agreement": "agreement of the normals",
-    "log_points": "number of points",
-    "extent": "size of the source against the bone",
-    "scale_z": "evidence that another size fits better",
-    "scale_off": "size with which the source fits best",
-    "log_scale_sd": "uncertainty of the size that fits best",
-    "size_margin": "fit of a source of another size",
-    "near_size_margin": "fit of a source grown or shrunk a little",
-    "mirror_margin": "fit of the mirrored source",
-    "rough_misfit": "misfit that may change within centimetres",
-    "free_space_score": "score against the camera's lines of sight",
-    "log_explained_mm2": "measured surface that the bone explains",
-    "explained_of_compared": "share of the compared surface that is explained",
-    "violating_of_compared": "share of the compared surface that the camera looked through",
-    "rival_margin": "lead over the next hypothesis of the scene",
-}  # in plain words
+# sign and plain words of each feature; +1: larger values can only raise the probability, -1: only lower it
+SHARED = {
+    "log_sigma": (0, "size of the residuals"),
+    "log_excess": (-1, "residuals against the noise of the source"),
+    "smooth_misfit": (-1, "smooth misfit to the bone, long range"),
+    "short_misfit": (-1, "smooth misfit to the bone, short range"),
+    "rough_misfit": (-1, "misfit that may change within centimetres"),
+    "inlier_ratio": (1, "share of the points that fit"),
+    "support": (1, "share of the attempts that ended here"),
+    "log_shift_sd": (-1, "uncertainty of the position"),
+    "log_turn_sd": (-1, "uncertainty of the rotation"),
+    "normal_agreement": (1, "agreement of the normals"),
+    "log_points": (0, "number of points"),
+    "extent": (0, "size of the source against the bone"),
+    "scale_z": (-1, "evidence that another size fits better"),
+    "scale_off": (0, "size with which the source fits best"),
+    "log_scale_sd": (0, "uncertainty of the size that fits best"),
+    "size_margin": (1, "fit of a source of another size"),
+    "near_size_margin": (1, "fit of a source grown or shrunk a little"),
+    "mirror_margin": (1, "fit of the mirrored source"),
+}
+OF_BONE = {
+    "residual": (0, "residual of the best hypothesis before refinement"),
+    "margin": (1, "lead over the next hypothesis"),
+    "log_hypotheses": (1, "number of hypotheses that competed"),
+}
+OF_VIEW = {
+    "free_space_score": (1, "score against the camera's lines of sight"),
+    "log_explained_mm2": (0, "measured surface that the bone explains"),
+    "explained_of_compared": (1, "share of the compared surface that is explained"),
+    "violating_of_compared": (-1, "share of the compared surface that the camera looked through"),
+    "rival_margin": (1, "lead over the next hypothesis of the scene"),
+}
+FEATURES_OF = {BONE: (*SHARED, *OF_BONE), SCENE: (*SHARED, *OF_VIEW)}
+SIGNS = {name: sign for name, (sign, _) in (SHARED | OF_BONE | OF_VIEW).items() if sign}
+FEATURE_LABELS = {name: label for name, (_, label) in (SHARED | OF_BONE | OF_VIEW).items()}
 MOST_NAMED, WORTH_NAMING = 2, -0.5  # features named against an answer, and the most log odds of one
 NEAR_SIZES = (0.9725, 1.0275)  # halfway: a source of this size fits in size 1 as well as in `SIZES`
 FEWEST_FOR_SIZE = 8  # least inliers for an estimate of the size

@@ -69,11 +69,6 @@ class PreparedTarget:
         return f"<PreparedTarget: {len(self.points)} points, {self.surface.extent_mm:.0f} mm across>"
 
     @property
-    def faces(self) -> NDArray[np.int64] | None:
-        """Faces of the loaded mesh, indices into `surface.points`; None for a cloud."""
-        return self.surface.faces
-
-    @property
     def kernel_view(self) -> tuple[Array, NDArray[np.int32], Array, float, float]:
         """Arguments that every loop of `kernels` takes."""
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
@@ -83,13 +78,12 @@ class PreparedTarget:
 
         Positive outside of where a sensor sees the surface (`offset_mm`), NaN beyond the reach of the field.
         """
-        if self.faces is None or not len(self.faces):
+        faces = self.surface.faces
+        if faces is None or not len(faces):
             return None
         if BoneMesh not in self.cache:  # when they are first asked for
             dropped = self.drawn[self.tree.query(self.drawn[:, :3])[0] > 0.0]
-            self.cache[BoneMesh] = bone_mesh.build(
-                self.surface.points, self.faces, (self.points, self.normals), dropped
-            )
+            self.cache[BoneMesh] = bone_mesh.build(self.surface.points, faces, (self.points, self.normals), dropped)
         distances, gradients = self.cache[BoneMesh].distances(points)
         distances[np.abs(distances) > self.field.reach_mm] = np.nan
         return distances - self.offset_mm, gradients

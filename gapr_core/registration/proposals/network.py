@@ -58,12 +58,16 @@ class NetworkProposer:
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Array:
         """Propose distinct poses, best first; none where the source is too small or too large for the network."""
+        import torch
+
         frame, cloud, features = self.prepare(target)
         try:
             moving = build_cloud(source.whole, frame, self.network.config)
         except InvalidPointCloudError:
             return np.empty((0, 4, 4))
-        found = self.match(moving, cloud, features)
+        with torch.inference_mode():
+            output = self.network(moving.to(self._device), cloud.to(self._device), features)
+        found = correspondences_mm(output.matches, moving, cloud)
         radius_mm = RADIUS_VOXELS * max(SMALLEST_VOXEL_MM, frame.voxel * frame.scale_mm)
         return local_to_global(found, radius_mm)
 
@@ -79,14 +83,6 @@ class NetworkProposer:
                 features = self.network.backbone(cloud.to(self._device))
             target.cache[key] = frame, cloud, features
         return target.cache[key]
-
-    def match(self, source: Cloud, target: Cloud, features: Features) -> Correspondences:
-        """Match clouds on the CPU; returns correspondences in mm."""
-        import torch
-
-        with torch.inference_mode():
-            output = self.network(source.to(self._device), target.to(self._device), features)
-        return correspondences_mm(output.matches, source, target)
 
     @property
     def _device(self) -> Any:

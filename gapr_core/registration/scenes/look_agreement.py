@@ -81,7 +81,8 @@ def unless_apart(
         fits[name] = fit
     answers = tuple(map(LookAnswer, scene.given, fits))
     do_not_fit = LookFit.APART in own_fits or 2 * own_fits.count(LookFit.BLIND) >= len(own_fits)
-    return replace(assessment, looks=answers).with_finding(_apart(answers) if do_not_fit else None)
+    answered = replace(assessment, looks=answers)
+    return answered.with_finding(_apart(answers)) if do_not_fit else answered
 
 
 def _fits(

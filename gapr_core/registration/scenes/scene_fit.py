@@ -66,7 +66,7 @@ def assess_part(
 ) -> Assessment:
     """Assess a pose that explains a part of a scene; see `assess_fit`."""
     source, members, fit = explained
-    seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
+    seen = clutter.seen_of(fit.T[None], scene, target, config.clutter, config.num_threads)
     of_view = features_of_view(seen, candidates, target) | {"inlier_ratio": float(fit.counts.sum() / len(members))}
     look = scene.look[members] if len(scene.images) > 1 else None
     view = {"seen": scene.source, "members": members, "viewpoint": scene.viewpoints.mean(axis=0), "look": look}

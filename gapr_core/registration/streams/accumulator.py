@@ -14,6 +14,7 @@ from gapr_core.geometry.twists import bound_mm, covariance_about, predicted_rmse
 from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks.conclude import by_threshold
 from gapr_core.registration.checks.deformation import covariance_of_half, of_motion
+from gapr_core.registration.checks.table import refuse
 from gapr_core.registration.fit.refinement import distances_mm, refine_fully
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
@@ -21,7 +22,7 @@ from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.streams.collection import MOST_OFF, Collection, together
 from gapr_core.registration.streams.evidence import fingerprint, is_repeated
 from gapr_core.registration.streams.tracker import Tracker
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import Finding, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.parallel import single_threaded_libraries
 
 Array = NDArray[np.float64]
@@ -156,11 +157,11 @@ class Accumulator(Collection):
             self.reset()
             self._kept = moved[-self.most :]
             why = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
-            return result.refused(RegistrationStatus.LOW_CONFIDENCE, why)
+            return result.refused(_off_the_bone(moved, why))
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             why = f"the {newest} off the bone where the others found it: left out"
-            return result.refused(RegistrationStatus.LOW_CONFIDENCE, why)
+            return result.refused(_off_the_bone(moved, why))
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
@@ -181,7 +182,9 @@ class Accumulator(Collection):
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if rests_from is None else kept[rests_from:]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
-        return result.refused(RegistrationStatus.LOW_CONFIDENCE, f"{why}; look at what is fixed to the bone")
+        advice = "look at what is fixed to the bone"
+        status = RegistrationStatus.LOW_CONFIDENCE
+        return result.refused(refuse("bone moves", motion.log_ratio, MOVES, status, why, advice))
 
     def _widened(
         self, result: RegistrationResult, added: Array, about_mm: Array, target: PreparedTarget
@@ -194,7 +197,7 @@ class Accumulator(Collection):
         tre95_mm = result.factor95 * bound_mm(covariance, target.points, result.centre_mm)
         refusal = by_threshold(result.confidence, result.confidence, tre95_mm, self.config)
         if refusal is not None:
-            return result.refused(refusal.status, refusal.text)
+            return result.refused(refusal)
         return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
@@ -246,6 +249,11 @@ class Accumulator(Collection):
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
     """Compute the median distance of (N, 3) points to the surface; points past its edge are off it."""
     return float(np.median(distances_mm(T, points, target)))
+
+
+def _off_the_bone(row: list[Array], text: str) -> Finding:
+    """Refuse for a row of sources off the bone."""
+    return refuse("off the bone", len(row), 1.0, RegistrationStatus.LOW_CONFIDENCE, text, "")
 
 
 def _is_among(source: Array, others: list[Array]) -> bool:

@@ -14,6 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration.caveats import answering
+from gapr_core.registration.checks.table import refuse
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
@@ -169,7 +170,7 @@ class LookAccumulator(Collection):
         clock.lap("compare")
         answer = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
         if verdict in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
-            answer = answer.refused(REFUSED_FOR[verdict], verdict.value)
+            answer = answer.refused(refuse("newest look", 1.0, 1.0, REFUSED_FOR[verdict], verdict.value, ""))
         return replace(answer, reason=answer.reason + self._update_looks(verdict, answer, newest, before, asked))
 
     def _of_those_that_fit(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,16 +41,12 @@ class PreviousPoses:
         """Propose the pose first, then its rivals."""
         return self.poses
 
-    def keep(self, poses: Sequence[Array]) -> None:
-        """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
-        self.poses = np.stack(poses)
-
     def follow(self, pose: Array, source: Array) -> None:
         """Move all poses with the source (N, 3), mm: the nearest one to `pose` becomes it, and comes first."""
         before = self.poses
         nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))
         moved = before @ (se3.inverse(before[nearest]) @ pose)
-        self.keep([moved[nearest], *np.delete(moved, nearest, axis=0)])
+        self.poses = np.stack([moved[nearest], *np.delete(moved, nearest, axis=0)])
 
 
 class TrackingRegistrar(Registrar):
@@ -75,13 +70,13 @@ class TrackingRegistrar(Registrar):
         clock = clock or Clock()
         if viewpoint is None and self._memory.place is not None:
             surface = offset_surface(target, self.config.sensor)
-            assessment = self._of_next_view(source, surface, start, clock, enough)
+            assessment = self._of_next_view(source, surface, clock, enough)
             if assessment is not None:
                 return assessment
         return super().assess(source, target, start, viewpoint, clock, enough)
 
     def _of_next_view(
-        self, source: ArrayLike, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+        self, source: ArrayLike, target: PreparedTarget, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """Assess a source without a viewpoint as the camera's next view; None where the previous poses are not sure."""
         scene = clutter.possible_view(source, self.config)
@@ -90,7 +85,7 @@ class TrackingRegistrar(Registrar):
         if scene is None or not places:
             return None
         place, _ = places[0]
-        assessment = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
+        assessment = self._remembered(scenes.scene_from(scene, place, self.config), target, clock, enough)
         if assessment is None or not assessment.reaches(self.config.min_confidence):
             return None
         assessment = self._checked(replace(assessment, inferred_viewpoint=place), clock, enough)
@@ -114,20 +109,15 @@ class TrackingRegistrar(Registrar):
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """Try the previous poses first; of several looks, which may contradict each other, all regions propose, too."""
-        poses = np.concatenate([start, self._memory.poses])
-        if len(scene.images) > 1:
-            return self._in_scene(scene, target, poses, clock)
-        assessment = self._remembered(scene, target, start, clock, enough)
-        return self._in_scene(scene, target, poses, clock) if assessment is None else assessment
+        found = None if len(scene.images) > 1 else self._remembered(scene, target, clock, enough)
+        return found or self._in_scene(scene, target, self._memory.poses, clock)
 
-    def _remembered(
-        self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
-    ) -> Assessment | None:
+    def _remembered(self, scene: Scene, target: PreparedTarget, clock: Clock, enough: Enough) -> Assessment | None:
         """Assess the best of the previous poses; None where it is not sure, or alone: then regions must propose.
 
         Of a few remembered hypotheses its own would be a large share: its support is that of the last regions.
         """
-        poses, config = np.concatenate([start, self._memory.poses]), self.config
+        poses, config = self._memory.poses, self.config
         found = clutter.verify(clutter.given(poses), scene, target, config.clutter, config.num_threads, poses)
         clock.lap("verify")
         if len(found.poses) < 2:

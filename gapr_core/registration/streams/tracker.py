@@ -90,15 +90,17 @@ class Tracker:
         """Forget the track and the evidence: the next source is registered in full."""
         self._forget_track()
         self._bone: PreparedTarget | None = None
+        self._alone: Tracker | None = None
         self._evidence.reset()
 
     def of_bone_alone(self) -> Tracker:
-        """Make a tracker of `Registrar.of_bone_alone` that begins a stream of its own."""
-        return type(self)(self.registrar.of_bone_alone(), self.recheck)
+        """Return the tracker of `Registrar.of_bone_alone`, with a stream of its own that `reset` ends."""
+        self._alone = self._alone or type(self)(self.registrar.of_bone_alone(), self.recheck)
+        return self._alone
 
     def sharing_points(self) -> Tracker:
         """Make a tracker for sources that share their points, as an `Accumulator`'s do: many count as one."""
-        twin = self.of_bone_alone()
+        twin = type(self)(self.registrar.of_bone_alone(), self.recheck)
         twin._evidence = Evidence(rho_pose=1.0, rho_bone=1.0)
         return twin
 
@@ -193,6 +195,7 @@ class Tracker:
         elif len(result.hypotheses) > 1:
             self._has_track = True
             self._memory.support = result.features.get("support", 0.0)
-            self._memory.keep([result.T_target_source, *(rival.T_target_source for rival in result.hypotheses[1:])])
+            rivals = [rival.T_target_source for rival in result.hypotheses[1:]]
+            self._memory.poses = np.stack([result.T_target_source, *rivals])
         else:
             self._forget_track()  # no rival: the next answer could not be weighed against anything

@@ -397,6 +397,8 @@ def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
     accumulator, result = creeping(step_mm, count)
     assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
     assert result.ok is not is_refused and (result.T_target_source is None) is is_refused
+    moved = [each for each in result.findings if each.check == "bone moves"]
+    assert [each.statistic > each.threshold == 6.0 for each in moved] == [True] * is_refused
     assert len(accumulator.collected) == (150 * 3 if is_refused else 150 * count)
 
 
@@ -470,6 +472,7 @@ def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_
     assert accumulator.register(own, target).ok
     answer = accumulator.register(moved + away, target)
     assert answer.ok is not is_refused and ("newest source lies off the bone" in answer.reason) is is_refused
+    assert [each.check for each in answer.findings] == ["off the bone"] * is_refused
     assert len(accumulator.collected) == (100 if is_refused else 500)
 
 

@@ -142,7 +142,7 @@ def test_a_stream_with_a_viewpoint_is_seen_from_there_to_the_last_cloud(target, 
 
 def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target, scene, monkeypatch):
     memory, given = PreviousPoses(), []
-    memory.keep([se3.inverse(T_SOURCE_TARGET), np.eye(4)])
+    memory.poses = np.stack([se3.inverse(T_SOURCE_TARGET), np.eye(4)])
     method = TrackingRegistrar(memory, Registrar(ONE_THREAD))
 
     def nothing(scene, target, poses, *settings):
@@ -307,7 +307,7 @@ def test_a_remembered_pose_has_no_more_support_than_the_last_full_registration_g
     """Of four remembered poses its own is a quarter; of all that regions propose, a right one is a fiftieth."""
     tracker._memory.support = most
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), tracker.config)
-    found = tracker._tracking._remembered(seen, target, np.empty((0, 4, 4)), Clock(), lambda answer: True)
+    found = tracker._tracking._remembered(seen, target, Clock(), lambda answer: True)
     assert found.features["support"] <= most and (found.features["support"] == most or most == 0.5)
 
 
@@ -321,7 +321,7 @@ def test_what_a_full_registration_found_of_support_is_remembered(target, scene):
 
 def test_regions_propose_where_only_one_remembered_pose_is_left(tracker, target, scene):
     """Nothing would compete with it."""
-    tracker._memory.keep(tracker._memory.poses[[0, 0]])
+    tracker._memory.poses = tracker._memory.poses[[0, 0]]
     assert tracker.register(scene[0] + 0.01, target, viewpoint=scene[1]).proposer == clutter.NAME
 
 

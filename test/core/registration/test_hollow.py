@@ -7,7 +7,7 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import quadrics, se3, visibility
-from gapr_core.registration.checks.assess import follows_both_cortices
+from gapr_core.registration.checks.assess import with_both_cortices
 
 WALL_MM = 4.0
 
@@ -73,4 +73,4 @@ def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, holl
         other = Specimen(make_bone("femur", 5), "femur", "5")
         source = make_pair("L2", other, seed).source
         assessment = registrar.assess(source, hollow)
-        assert not follows_both_cortices(assessment, registrar.config)
+        assert with_both_cortices(assessment, registrar.config) is None

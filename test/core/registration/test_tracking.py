@@ -14,6 +14,7 @@ from gapr_core.registration.streams import tracker as trackers
 from gapr_core.registration.streams.evidence import fingerprint, is_repeated
 from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.registration.uncertainty.error_calibration import Precision
+from gapr_core.surface import Surface
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 
@@ -43,6 +44,14 @@ def test_after_the_first_source_only_what_is_remembered_is_asked(tracker, frames
     assert [r.proposer == "track" for r in results] == [False, True, True, True]
     assert all(is_right(r, pair) for r, pair in zip(results, frames, strict=True))
     assert all(r.confidence >= tracker.registrar.config.sure for r in results[1:])
+
+
+def test_a_stream_of_meshes_is_tracked_too_until_a_reset(tracker, frames, prepared):
+    meshes = [Surface(pair.source, np.array([[0, 1, 2]])) for pair in frames]
+    results = [tracker.register(mesh, prepared) for mesh in meshes]
+    assert [r.proposer == "track" for r in results] == [False, True, True, True]
+    tracker.reset()
+    assert tracker.register(meshes[0], prepared).proposer != "track"
 
 
 @pytest.fixture
@@ -128,7 +137,7 @@ def test_a_wrong_track_is_left(tracker, frames, prepared):
     """Every remembered pose is wrong: none may be followed."""
     first = tracker.register(frames[0].source, prepared)
     rivals = [hypothesis.T_target_source for hypothesis in first.hypotheses[1:]]
-    tracker._memory.keep([*rivals[-1:], *rivals[:-1]])
+    tracker._memory.poses = np.stack([*rivals[-1:], *rivals[:-1]])
     result = tracker.register(frames[1].source, prepared)
     assert result.ok and is_right(result, frames[1])
 
@@ -209,7 +218,7 @@ def test_a_pose_without_rivals_is_not_followed(frames, prepared, believing):
 def test_the_rivals_move_with_the_source_whichever_of_them_is_followed(answer):
     memory, rng = PreviousPoses(), np.random.default_rng(2)
     poses = [se3.exp(rng.normal(size=6) * [30, 30, 30, 1, 1, 1]) for _ in range(3)]
-    memory.keep(poses)
+    memory.poses = np.stack(poses)
     moved = se3.exp([2.0, -1.0, 0.5, 0.02, 0.01, -0.03])
     memory.follow(poses[answer] @ moved, rng.normal(size=(50, 3)) * 20.0)
     others = [pose for k, pose in enumerate(poses) if k != answer]

@@ -5,15 +5,16 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus, confidence_text
+from gapr_core.results import Effect, Finding, Hypothesis, RegistrationResult, RegistrationStatus, confidence_text
 
 
 def test_a_refusal_keeps_what_is_looked_at_and_nothing_that_goes_with_a_pose():
     pose = {"T_target_source": np.eye(4), "covariance": np.eye(6), "centre_mm": np.ones(3), "factor95": 1.7}
     looked_at = {"hypotheses": (Hypothesis(np.eye(4), 0.9),), "confidence": 0.9, "inlier_ratio": 0.8}
     answer = RegistrationResult(RegistrationStatus.OK, tre_mm=0.5, tre95_mm=0.9, **pose, **looked_at)
-    refused = answer.refused(RegistrationStatus.AMBIGUOUS, "why")
-    nothing = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="why", **looked_at)
+    finding = Finding("check", Effect.REFUSE, 2.0, 1.0, RegistrationStatus.AMBIGUOUS, "why", "do")
+    refused = answer.refused(finding)
+    nothing = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="why; do", findings=(finding,), **looked_at)
     for each in fields(RegistrationResult):
         assert getattr(refused, each.name) == getattr(nothing, each.name), each.name
 

@@ -197,6 +197,7 @@ def test_the_distance_to_a_mesh_is_exact_and_negative_inside_even_if_its_faces_a
 
 def test_a_refusal_keeps_no_caveat_of_a_pose_and_no_error_at_a_target():
     result = replace(accepted(warnings=(caveats.SENSOR_UNKNOWN,)), bone=box([60.0, 60.0, 300.0]))
-    refused = result.with_targets([[0.0, 0.0, 0.0]]).refused(RegistrationStatus.AMBIGUOUS, "two fit")
+    finding = Finding("equal rival", Effect.REFUSE, 1.0, 1.0, RegistrationStatus.AMBIGUOUS, "two fit")
+    refused = result.with_targets([[0.0, 0.0, 0.0]]).refused(finding)
     assert refused.warnings == () and refused.targets == () and refused.errors_at([[0.0, 0.0, 0.0]]) == ()
     assert result.with_targets(np.zeros((0, 3))).warnings == result.warnings  # an empty plan

@@ -70,7 +70,7 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
             centre_mm=a.centre_mm,
         )
     asked = question(a, refusal, config)
-    reason = "; ".join(filter(None, (refusal.text, refusal.advice, asked and asked.text)))
+    reason = "; ".join(filter(None, (refusal.text, refusal.advice, asked.text if asked else "")))
     return replace(common, status=refusal.status, reason=reason, findings=(*findings, asked) if asked else findings)
 
 

@@ -14,7 +14,7 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem import target as targets
-from gapr_core.registration.proposals import consensus
+from gapr_core.registration.proposals import consensus, network
 from gapr_core.registration.proposals.network import RADIUS_VOXELS, SHIPPED, SMALLEST_VOXEL_MM, NetworkProposer
 
 
@@ -32,8 +32,8 @@ def proposer(toy):
 
 def test_proposals_are_rigid_poses_best_first(toy, pair, monkeypatch):
     one, asked = proposer(toy), []
-    match = one.match
-    monkeypatch.setattr(one, "match", lambda *clouds: asked.append(match(*clouds)) or asked[-1])
+    found_mm = network.correspondences_mm
+    monkeypatch.setattr(network, "correspondences_mm", lambda *each: asked.append(found_mm(*each)) or asked[-1])
     found = one.propose(*pair, np.random.default_rng(0))
     assert found.shape == (len(found), 4, 4) and len(found) > 1
     frame = one.prepare(pair[1])[0]

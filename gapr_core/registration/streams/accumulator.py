@@ -253,7 +253,7 @@ def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> flo
 
 def _off_the_bone(row: list[Array], text: str) -> Finding:
     """Refuse for a row of sources off the bone."""
-    return refuse("off the bone", len(row), 1.0, RegistrationStatus.LOW_CONFIDENCE, text, "")
+    return refuse("off the bone", len(row), 0.0, RegistrationStatus.LOW_CONFIDENCE, text, "")
 
 
 def _is_among(source: Array, others: list[Array]) -> bool:

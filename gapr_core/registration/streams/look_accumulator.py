@@ -170,7 +170,7 @@ class LookAccumulator(Collection):
         clock.lap("compare")
         answer = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
         if verdict in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
-            answer = answer.refused(refuse("newest look", 1.0, 1.0, REFUSED_FOR[verdict], verdict.value, ""))
+            answer = answer.refused(refuse("newest look", 1.0, 0.0, REFUSED_FOR[verdict], verdict.value, ""))
         return replace(answer, reason=answer.reason + self._update_looks(verdict, answer, newest, before, asked))
 
     def _of_those_that_fit(

@@ -108,7 +108,10 @@ class TrackingRegistrar(Registrar):
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """Try the previous poses first; of several looks, which may contradict each other, all regions propose, too."""
+        """Try the previous poses first; of several looks, which may contradict each other, all regions propose, too.
+
+        The previous poses are the start: a stream has no other (`start` is empty).
+        """
         found = None if len(scene.images) > 1 else self._remembered(scene, target, clock, enough)
         return found or self._in_scene(scene, target, self._memory.poses, clock)
 

@@ -472,7 +472,8 @@ def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_
     assert accumulator.register(own, target).ok
     answer = accumulator.register(moved + away, target)
     assert answer.ok is not is_refused and ("newest source lies off the bone" in answer.reason) is is_refused
-    assert [each.check for each in answer.findings] == ["off the bone"] * is_refused
+    found = [(each.check, each.statistic > each.threshold) for each in answer.findings]
+    assert found == [("off the bone", True)] * is_refused
     assert len(accumulator.collected) == (100 if is_refused else 500)
 
 
